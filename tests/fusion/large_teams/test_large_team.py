@@ -11,7 +11,7 @@ import pytest
 
 import relpos
 from crowd import Crowd, CrowdSettings, simulate_crowd
-from relpos import fusion
+from relpos import fusion, tracks
 from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus, switching
 from relpos.fusion.large_teams.estimator import LargeTeam
@@ -19,6 +19,7 @@ from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.fusion.switching import LARGE_TEAM
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
 from relpos.runs import NodeInfo
+from relpos.simulation.missions import simulate_mission
 
 CROWD = CrowdSettings(nodes=60, seconds=50)
 
@@ -290,3 +291,27 @@ def test_a_tag_is_as_high_as_it_is_worn_and_its_wearer_has_climbed(size: int, cl
             estimates += made.process(Range(second - 0.5, n, n + 1, 3.0))
     for estimate in [*estimates, *made.finish()]:
         assert [n.z_m for n in estimate.nodes] == pytest.approx([1.3] * size, abs=0.3)
+
+
+def test_places_and_bearings_in_the_common_frame_are_no_surer_than_right() -> None:
+    """Of two missions: no range tells how a whole team has turned and shifted."""
+    places, bearings = [], []
+    for seed in (7, 8):
+        run = simulate_mission("mission-base", seed, {"nodes": 24, "seconds": 60})
+        truth = tracks.true_tracks(run.truth)
+        for e in estimates_of(run.priors, run.measurements)[0][20:]:
+            at = {
+                node: np.array([np.interp(e.time_s, t.time_s, axis) for axis in (t.x_m, t.y_m)])
+                for node, t in truth.items()
+            }
+            for n in e.nodes:
+                off = np.array([n.x_m, n.y_m]) - at[n.node]
+                xy = n.covariance_xy_m2
+                told = np.array([[n.variance_x_m2, xy], [xy, n.variance_y_m2]])
+                places.append(off @ np.linalg.solve(told, off) / 2.0)
+            for p in e.pairs:
+                east, north = at[p.peer] - at[p.node]
+                off_rad = math.remainder(p.bearing_rad - math.atan2(north, east), math.tau)
+                bearings.append((off_rad / p.sigma_bearing_rad) ** 2)
+    assert np.mean(places) < 1.5
+    assert np.mean(bearings) < 1.5

@@ -228,3 +228,33 @@ def test_a_crowd_has_the_neighbours_it_was_asked_for() -> None:
     )
     steps = np.linalg.norm(np.diff(crowd.poses[:, :, :2], axis=0), axis=2)
     assert steps.max() <= 0.5 + 1e-9
+
+
+@pytest.mark.parametrize(("width_m", "left_share"), [(100.0, 0.01), (10.0, 0.5)])
+def test_the_teams_common_motion_is_kept_apart_and_told(width_m: float, left_share: float) -> None:
+    """Far strips, whose covariance the chain infers anew, seem to contain some of it again."""
+    rng = np.random.default_rng(6)
+    pose = np.column_stack([rng.uniform(0, 60, 30), rng.uniform(0, 8, 30), rng.uniform(-3, 3, 30)])
+    made, *_ = started(pose, width_m)
+    node, peer = pairs_within(pose, 10.0)
+    measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
+    made.update(node, peer, measured)
+    made.predict(np.arange(30), random_moves(rng, 30))
+    before, marginals, between = covariance_of(made), made.marginals(), made.pairs(node, peer)
+    made.take_out_common_motion()
+    # By its definition: shifts east and north and a turn about the origin, of every pose.
+    motion = np.zeros((30, 5, 3))
+    motion[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    motion[:, 0, 2], motion[:, 1, 2] = -made.pose[:, 1], made.pose[:, 0]
+    g = motion.reshape(-1, 3)
+    contained = np.linalg.inv(g.T @ np.linalg.solve(before, g))
+    assert np.allclose(made.common, contained, rtol=1e-2, atol=1e-4)
+    left = covariance_of(made)
+    again = np.linalg.inv(g.T @ np.linalg.solve(left, g))
+    assert again[2, 2] < left_share * contained[2, 2]
+    layout = made._layout
+    close = np.abs(layout.strip[:, None] - layout.strip) <= 1
+    kept = np.repeat(np.repeat(close, 5, axis=0), 5, axis=1)
+    assert np.allclose((left + g @ made.common @ g.T)[kept], before[kept], atol=1e-9)
+    assert np.allclose(made.marginals() + made.common_marginals(), marginals, atol=1e-9)
+    assert np.allclose(made.pairs(node, peer)[:2], between[:2], atol=1e-9)

@@ -3,15 +3,10 @@
 Headings err, so that the whole team turns and shifts slowly in the world's frame. Ranges say
 nothing of that. Left in the covariances it grows without end, and what is linear for small angles
 alone (the mean of a displacement, the mean of two places) becomes too short by it: distances
-shrink. With G (D, 3) the change of all poses by a small shift east, north and turn of the team,
-
-    S = (G^T P^-1 G)^-1
-
-is the largest covariance of such a rigid motion that P contains: P - G S G^T is the covariance of
-what the ranges concern, and is still one. That remains in the hypotheses, and S is summed up in
-``HypothesisSet.common``. As the world's frame is arbitrary, all else is unchanged. Absolute
-headings do measure the rotation: before them it is put back. Reference implementation:
-:mod:`reference.bank`.
+shrink. With G and S of :mod:`relpos.fusion.rigid_motion`, P - G S G^T, the covariance of what the
+ranges concern, remains in the hypotheses, and S is summed up in ``HypothesisSet.common``. As the
+world's frame is arbitrary, all else is unchanged. Absolute headings do measure the rotation: before
+them it is put back. Reference implementation: :mod:`reference.bank`.
 """
 
 from __future__ import annotations
@@ -23,11 +18,9 @@ from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, store
 from relpos.fusion.bank.storage import PER_NODE, POSE, Hypotheses, block_of, place, row_place
 from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.rigid_motion import RIGID, rigid_motion
 
 Floats = npt.NDArray[np.float64]
-
-RIGID = 3
-"""Parameters of a rigid motion: east, north (m), turn (rad) about the world's origin."""
 
 LEAST_RAD = 0.03
 """From this deviation of the common rotation on it is taken out. A mean direction of so much is
@@ -39,14 +32,6 @@ LEFT = 1e-4, 1e-5
 
 KNOWN = 1e-9, 1e-12
 """Share of variances, and m^2 or rad^2, added to them: what is known exactly has an inverse."""
-
-
-def rigid_motion(x_m: Floats, y_m: Floats) -> Floats:
-    """Return G (3 N, 3): how poses x, y, heading at (N,), (N,) change with a rigid motion."""
-    g = np.zeros((len(x_m), 3, RIGID))
-    g[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    g[:, 0, 2], g[:, 1, 2] = -y_m, x_m
-    return g.reshape(-1, RIGID)
 
 
 def estimate(mean: Floats, covariance: Floats, nodes: int) -> tuple[Floats, Floats]:
@@ -62,13 +47,6 @@ def estimate(mean: Floats, covariance: Floats, nodes: int) -> tuple[Floats, Floa
     solved = np.linalg.solve(own + np.diag(KNOWN[0] * own.diagonal() + KNOWN[1]), g)
     s = np.linalg.inv(g.T @ solved)
     return np.asarray(s @ solved.T, np.float64), np.asarray(s, np.float64)
-
-
-def about_origin(s: Floats, x_m: float, y_m: float) -> Floats:
-    """Return the covariance of a rigid motion (3, 3) about a point as one about the origin."""
-    move = np.array([[1.0, 0.0, y_m], [0.0, 1.0, -x_m], [0.0, 0.0, 1.0]])
-    moved: Floats = move @ s @ move.T
-    return moved
 
 
 @inner

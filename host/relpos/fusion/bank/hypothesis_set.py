@@ -33,6 +33,7 @@ from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex
 from relpos.fusion.resampling import systematic
+from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -82,7 +83,7 @@ class HypothesisSet:
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its range bias in the state."""
         self._allow_common(np.arange(count))
-        self.common: Floats = np.zeros((common_rotation.RIGID, common_rotation.RIGID))
+        self.common: Floats = np.zeros((RIGID, RIGID))
         """Covariance of the rigid motion of the whole team that has been taken out."""
         self.spread_components()
 
@@ -189,7 +190,7 @@ class HypothesisSet:
         if self.count > 1:
             common_rotation.align(self.arrays, middle, storage.lay_out(motion))
         between = np.einsum("k,ki,kj->ij", weight, motion, motion)
-        self.common += common_rotation.about_origin(own + between, *middle)
+        self.common += about_origin(own + between, *middle)
         return self.moments(poses_alone=True)
 
     def relative_moments(self) -> tuple[Floats, Floats]:
@@ -200,7 +201,7 @@ class HypothesisSet:
         _, known = common_rotation.estimate(mean, covariance, self.nodes)
         entries = storage.order(self.nodes, len(mean))[: storage.POSE * self.nodes]
         x_m, y_m = mean[entries[0::3]], mean[entries[1::3]]
-        g = common_rotation.rigid_motion(x_m - x_m.mean(), y_m - y_m.mean())
+        g = rigid_motion(x_m - x_m.mean(), y_m - y_m.mean())
         covariance[np.ix_(entries, entries)] -= g @ known @ g.T
         return mean, covariance
 
@@ -213,7 +214,7 @@ class HypothesisSet:
     def common_covariance(self, mean: Floats) -> Floats:
         """Return what has been taken out of the mixture's covariance (D, D), by its mean (D,)."""
         entries = storage.order(self.nodes, len(mean))[: storage.POSE * self.nodes]
-        g = common_rotation.rigid_motion(mean[entries[0::3]], mean[entries[1::3]])
+        g = rigid_motion(mean[entries[0::3]], mean[entries[1::3]])
         covariance = np.zeros((len(mean), len(mean)))
         covariance[np.ix_(entries, entries)] = g @ self.common @ g.T
         return covariance

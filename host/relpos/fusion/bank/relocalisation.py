@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
-from relpos.fusion.bank.common_rotation import about_origin
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mirrored import mirror_image
 from relpos.fusion.bank.mixture import PERTURBED_UPDATES
@@ -29,6 +28,7 @@ from relpos.fusion.models.odometry_faults import (
     LOST_RAD,
     perturb,
 )
+from relpos.fusion.rigid_motion import about_origin
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -20,6 +20,7 @@ BLAS and LAPACK work on whole blocks; symmetric ones are kept as their lower hal
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +56,26 @@ def update(layout: StripLayout, covariance: Floats, information: Floats, push: F
     moved = np.empty((len(layout.strip), COVARIANCE, push.shape[1]))
     _back_substitute(layout, eliminated, diagonal, following, moved)
     return moved
+
+
+def information_of(layout: StripLayout, covariance: Floats, motion: Sequence[Floats]) -> Floats:
+    """Return G^T P^-1 G (C, C) of the whole chain; ``motion`` is G, strip by strip (5 n, C).
+
+    With B of the strip before, it is the sum of (G_k - B^T G_k-1)^T V_k^-1 (G_k - B^T G_k-1).
+    """
+    diagonal, following = layout.views(covariance, COVARIANCE)
+    information = np.zeros((motion[0].shape[1],) * 2)
+    given, rest = _copy(diagonal[0]), motion[0]
+    for k, (block, own) in enumerate(zip(diagonal, motion, strict=True)):
+        half = _solve_lower(_lower(given), _copy(rest))
+        information += half.T @ half
+        if k < len(following):
+            # L^-1 P_k,k+1 and L^-1 G_k: their products are B^T P_k,k+1 and B^T G_k.
+            factor = _lower(_copy(block))
+            ahead = _solve_lower(factor, _copy(following[k]))
+            given = _minus_square(ahead, diagonal[k + 1])
+            rest = motion[k + 1] - ahead.T @ _solve_lower(factor, _copy(own))
+    return information
 
 
 class _Eliminated(NamedTuple):

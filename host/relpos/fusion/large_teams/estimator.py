@@ -182,6 +182,8 @@ class LargeTeam:
                 self._climb(step.time_s)
                 self._diffuse(self._row, step.time_s, timeline)
                 self._add_found(self.initialiser.find(step.time_s))
+                if len(self._row) > 1:
+                    self.filter.take_out_common_motion()
                 self._slew_clocks(step.time_s, timeline)
                 return self._estimate(step.time_s)
         return None
@@ -426,7 +428,7 @@ class LargeTeam:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
-        own = self.filter.marginals().tolist() if self._row else []
+        own = (self.filter.marginals() + self.filter.common_marginals()).tolist()
         pose = self.filter.pose.tolist()
         nodes = []
         for node in sorted(self._known):
@@ -473,7 +475,8 @@ class LargeTeam:
         near = near[np.lexsort((ids[near[:, 1]], ids[near[:, 0]]))]
         near = near.astype(np.int64)
         distance, along, across, bearing = self.filter.pairs(near[:, 0].copy(), near[:, 1].copy())
-        sigma_bearing = np.minimum(np.sqrt(across) / np.maximum(distance, 1e-9), ANY_ANGLE_RAD)
+        bearing_rad2 = across / np.maximum(distance, 1e-9) ** 2 + self.filter.common[2, 2]
+        sigma_bearing = np.minimum(np.sqrt(bearing_rad2), ANY_ANGLE_RAD)
         rows = zip(
             ids[near[:, 0]].tolist(), ids[near[:, 1]].tolist(), distance.tolist(),
             np.sqrt(along).tolist(), bearing.tolist(), sigma_bearing.tolist(), strict=True,
