@@ -283,7 +283,7 @@ class NeighbourhoodFilter:
         whole = np.pad(poses, ((0, 0), (0, COVARIANCE - 3), (0, 0))).reshape(-1, RIGID)
         motion = [whole[rows] for rows in self._layout.states()]
         information = chain.information_of(self._layout, self._covariance, motion)
-        s: Floats = np.linalg.inv(information) - LEFT
+        s = np.asarray(np.linalg.inv(information) - LEFT, np.float64)
         if np.linalg.eigvalsh(s)[0] <= 0.0:
             return
         diagonal, following = self._layout.views(self._covariance, COVARIANCE)
