@@ -11,14 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations
-from math import atan2, hypot, inf, pi, sqrt
+from math import atan2, cos, hypot, inf, pi, sin, sqrt
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.models.motion import unseen_variance
+from relpos.fusion.models.unseen_walk import UnseenWalk
 from relpos.measurements import Measurement
 
 Floats = npt.NDArray[np.float64]
@@ -276,12 +276,6 @@ def by_silence(epochs: int) -> NodeStatus:
     return NodeStatus.STALE if epochs >= STALE_EPOCHS else NodeStatus.OK
 
 
-PLACING_RANGES = 3
-"""So many ranges place a node of a large team whose motion is missing: what it walks unseen begins
-at the oldest of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0.44
-so). The bank knows its velocity beside (``models/unseen_walk.py``)."""
-
-
 @dataclass(slots=True)
 class Presence:
     """What every estimator keeps of a node beside its pose: its height, and its last motion."""
@@ -291,10 +285,10 @@ class Presence:
     """Forward and left, by its newest displacement."""
     news_s: float = -inf
     silent_epochs: int = 0
+    unseen: UnseenWalk | None = None
+    """How it walked while its motion was missing last."""
     diffused_s: float = -inf
     """Until then it may have walked without a report, and its ranges have moved it."""
-    ranges_s: tuple[float, ...] = (-inf,) * PLACING_RANGES
-    """Times of its last ranges."""
 
     @property
     def uneven_m2(self) -> float:
@@ -303,33 +297,49 @@ class Presence:
 
     def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
         """Return its heading and the deviation, which are known but for what it turned unseen."""
-        return heading_rad, sigma_rad
+        if self.unseen is None or self.diffused_s < time_s:
+            return heading_rad, sigma_rad
+        return self.unseen.facing(time_s, heading_rad, sigma_rad)
 
     def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:
             self.news_s = time_s
 
-    def ranged(self, time_s: float) -> None:
-        """Note that a range of the node was used."""
-        self.received(time_s)
-        self.ranges_s = (*self.ranges_s[1:], time_s)
-
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""
         self.silent_epochs = 0 if self.news_s > epoch_s else self.silent_epochs + 1
 
-    def diffuse(self, time_s: float, reported_s: float) -> float:
-        """Return the variance (m^2, both axes) of what it has walked unseen since the last call.
+    def is_unseen(self, time_s: float, reported_s: float, heading_rad: Callable[[], float]) -> bool:
+        """Return whether it walks unseen: it reported its motion up to ``reported_s`` alone.
 
-        0 for a node that has reported its motion up to ``time_s`` (s), or never did.
+        It does so from its last velocity on, with the heading that is asked for then. Who never
+        reported any motion does not.
         """
         since_s = max(self.diffused_s, reported_s)
         if not -inf < since_s < time_s:
-            return 0.0
+            return False
+        if self.unseen is None or self.unseen.since_s != reported_s:
+            heading = heading_rad()
+            c, s = cos(heading), sin(heading)
+            forward, left = self.velocity_m_s
+            world_m_s = np.array([c * forward - s * left, s * forward + c * left])
+            self.unseen = UnseenWalk(reported_s, world_m_s)
+        self.diffused_s = since_s
+        return True
+
+    def walk_unseen(self, time_s: float) -> tuple[float, Floats, Floats] | None:
+        """Walk on without a report; None where there is nothing left to walk.
+
+        Returns the length of the path (m), the way (2,), and by how much its place is less
+        certain (2, 2).
+        """
+        if self.unseen is None or self.diffused_s >= time_s:
+            return None
+        duration_s = time_s - self.diffused_s
         self.diffused_s = time_s
-        placed_s = max(reported_s, self.ranges_s[0])
-        return unseen_variance(time_s - placed_s) - unseen_variance(since_s - placed_s)
+        path_m = self.unseen.speed_m_s * duration_s
+        return path_m, *self.unseen.walk(duration_s)
 
     def undiffused(self, time_s: float, duration_s: float) -> float:
         """Return the share of a displacement up to ``time_s`` that ranges have not made yet."""

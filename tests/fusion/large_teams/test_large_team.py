@@ -241,6 +241,25 @@ def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges()
     assert np.nanmean(np.abs(error_m)) < 0.6
 
 
+def test_people_of_a_large_team_walk_on_while_their_motion_is_missing_and_face_their_way() -> None:
+    run = relpos.simulate("mission-gap-20", 11, nodes=LARGE_TEAM + 1, seconds=60)
+    result = relpos.fuse(run)
+    scored = relpos.evaluate(result, run, bound=False).metrics
+    # Who has not reported yet is taken to stand.
+    late = scored.time_s > 20.0
+    error_m = (scored.pair_distance_m - scored.pair_true_distance_m)[late]
+    assert math.sqrt(np.nanmean(error_m**2)) < 0.2
+    truth = tracks.true_tracks(run.truth)
+    turned = []
+    for e in (e for e in result.estimates if e.time_s > 20.0):
+        for n in e.nodes:
+            true = truth[n.node]
+            heading = np.interp(e.time_s, true.time_s, np.unwrap(true.heading_rad))
+            off_rad = math.remainder(n.heading_rad - heading, math.tau)
+            turned.append((off_rad / n.sigma_heading_rad) ** 2)
+    assert np.mean(turned) < 2.0
+
+
 @pytest.mark.parametrize(
     ("condition", "wrong"),
     [

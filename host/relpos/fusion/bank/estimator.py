@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -76,16 +77,10 @@ class _Known(Presence):
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
     within: WithinReport = field(default_factory=WithinReport)
-    unseen: UnseenWalk | None = None
 
     @property
     def uneven_m2(self) -> float:
         return self.within.variance_m2
-
-    def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
-        if self.unseen is None or self.diffused_s < time_s:
-            return heading_rad, sigma_rad
-        return self.unseen.facing(time_s, heading_rad, sigma_rad)
 
 
 @dataclass(slots=True)
@@ -267,7 +262,7 @@ class Bank:
         ends = nodes_of(step.ranges)
         self._diffuse(ends, time_s, timeline)
         for node in ends:
-            self._meet(node).ranged(time_s)
+            self._meet(node).received(time_s)
         for one in step.ranges:
             self.vertical.ranged(one)
         ranges: Sequence[Range] = step.ranges
@@ -348,34 +343,22 @@ class Bank:
         Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
         for node in sorted((self._row.keys() & nodes) - self.vertical.posts):
-            known, reported_s = self._known[node], timeline.reported_s(node)
-            since_s = max(known.diffused_s, reported_s)
-            if not -math.inf < since_s < time_s:
-                continue
-            if known.unseen is None or known.unseen.since_s != reported_s:
-                known.unseen = UnseenWalk(reported_s, self._last_velocity_m_s(node))
-            known.diffused_s = since_s
-            self._walk_unseen(node, time_s)
+            known, heading = self._known[node], partial(self._heading_rad, node)
+            if known.is_unseen(time_s, timeline.reported_s(node), heading):
+                self._walk_unseen(node, time_s)
 
     def _walk_unseen(self, node: int, time_s: float) -> None:
         """Let a node walk on without a report."""
-        known = self._known[node]
-        if known.unseen is None or known.diffused_s >= time_s:
-            return
-        duration_s = time_s - known.diffused_s
-        self.range_correlation.move(node, known.unseen.speed_m_s * duration_s, 0.0)
-        way_m, unknown = known.unseen.walk(duration_s)
-        self.core.relocalisation.diffuse(self._row[node], way_m, unknown)
-        known.diffused_s = time_s
-        self._counters["diffusions"] += 1
+        walked = self._known[node].walk_unseen(time_s)
+        if walked is not None:
+            path_m, way_m, unknown = walked
+            self.range_correlation.move(node, path_m, 0.0)
+            self.core.relocalisation.diffuse(self._row[node], way_m, unknown)
+            self._counters["diffusions"] += 1
 
-    def _last_velocity_m_s(self, node: int) -> Floats:
-        """Return a node's velocity by its last report, in world axes."""
+    def _heading_rad(self, node: int) -> float:
         mean, _ = self.core.hypotheses.moments(poses_alone=True)
-        heading = float(mean[PER_NODE * self._row[node] + StateIndex.HEADING])
-        forward, left = self._known[node].velocity_m_s
-        c, s = math.cos(heading), math.sin(heading)
-        return np.array([c * forward - s * left, s * forward + c * left])
+        return float(mean[PER_NODE * self._row[node] + StateIndex.HEADING])
 
     def _unseen(
         self, nodes: Iterable[int], time_s: float

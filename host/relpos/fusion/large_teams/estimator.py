@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, prior_information
 from relpos.fusion.large_teams.variance_components import VarianceComponents
-from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
+from relpos.fusion.models.motion import WALK_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
@@ -270,10 +271,13 @@ class LargeTeam:
             return
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
-        # Ranges have made the rest of a late displacement already.
-        moves[:, :2] *= np.array(
-            [[self._known[a.node].undiffused(a.time_s, a.duration_s)] for a in steps]
-        )
+        for a, move in zip(steps, moves, strict=True):
+            if self._known[a.node].unseen is not None and a.duration_s > WALK_S * a.fraction:
+                # So long a report says nothing of where its end led to.
+                move[:2] = 0.0
+                self._walk_unseen(a.node, a.time_s)
+            else:
+                move[:2] *= self._known[a.node].undiffused(a.time_s, a.duration_s)
         reported = np.array([reported_sigmas(a) for a in steps])
         dx, dy, turn, duration_s = moves.T
         variance = base_variances(moves, reported) * self._components.factor[rows]
@@ -292,11 +296,21 @@ class LargeTeam:
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to."""
         for node in sorted((self._row.keys() & nodes) - self.vertical.posts):
-            unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
-            if unseen_m2 > 0.0:
-                rows = np.array([self._row[node]])
-                self.filter.inflate(rows, math.sqrt(0.5 * unseen_m2), 0.0)
-                self._own["diffusions"] += 1
+            known, heading = self._known[node], partial(self._heading_rad, node)
+            if known.is_unseen(time_s, timeline.reported_s(node), heading):
+                self._walk_unseen(node, time_s)
+
+    def _walk_unseen(self, node: int, time_s: float) -> None:
+        """Let a node walk on without a report."""
+        walked = self._known[node].walk_unseen(time_s)
+        if walked is not None:
+            path_m, way_m, unknown = walked
+            self._correlation.move(node, path_m, 0.0)
+            self.filter.diffuse(self._row[node], way_m, unknown)
+            self._own["diffusions"] += 1
+
+    def _heading_rad(self, node: int) -> float:
+        return float(self.filter.pose[self._row[node], 2])
 
     # -- ranges --------------------------------------------------------------------------------
 
@@ -304,7 +318,7 @@ class LargeTeam:
         ends = nodes_of(step.ranges)
         self._diffuse(ends, step.time_s, timeline)
         for node in ends:
-            self._presence(node).ranged(step.time_s)
+            self._presence(node).received(step.time_s)
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
@@ -359,6 +373,7 @@ class LargeTeam:
         innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2)
         outliers = self._outliers.expected(time_s, pairs)
         inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
+        self._correct_unseen(pairs, time_s, before[:, :2], prior)
         horizontal -= slopes @ f.terms
         self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])
         self._correlation.learn(pairs, innovation, inlier)
@@ -368,6 +383,21 @@ class LargeTeam:
         self._learn_sigma(node, peer, horizontal, inlier)
         news = 1.0 - outliers[:, 0]
         self._inflate(both, np.tile(inlier, 2), np.tile(news, 2))
+
+    def _correct_unseen(
+        self, pairs: Sequence[tuple[int, int]], time_s: float, place_m: Floats, prior: Floats
+    ) -> None:
+        """Learn how people walk unseen from what the ranges since ``time_s`` corrected.
+
+        ``place_m`` (N, 2) and ``prior`` (N, 4) were the places and marginals before.
+        """
+        posterior = self.filter.marginals()
+        for node in sorted({node for pair in pairs for node in pair}):
+            known, row = self._known[node], self._row[node]
+            if known.unseen is not None and known.diffused_s >= time_s:
+                moved_m = self.filter.pose[row, :2] - place_m[row]
+                covariances = (of[row][[0, 2, 2, 1]].reshape(2, 2) for of in (prior, posterior))
+                known.unseen.correct(moved_m, *covariances)
 
     def _learn_sigma(self, node: Indices, peer: Indices, measured: Floats, inlier: Floats) -> None:
         """Learn the range sigma by online expectation maximisation.
@@ -434,7 +464,8 @@ class LargeTeam:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
-        own = (self.filter.marginals() + self.filter.common_marginals()).tolist()
+        relative, common = self.filter.marginals(), self.filter.common_marginals()
+        own, turned = (relative + common).tolist(), float(self.filter.common[2, 2])
         pose = self.filter.pose.tolist()
         nodes = []
         for node in sorted(self._known):
@@ -445,10 +476,12 @@ class LargeTeam:
                 continue
             xx, yy, xy, hh = own[row]
             x, y, heading = pose[row]
+            heading, within = known.facing(time_s, heading, math.sqrt(hh - turned))
             nodes.append(
                 NodeEstimate(
                     node, x, y, math.remainder(heading, 2.0 * math.pi), xx, yy, xy,
-                    min(math.sqrt(hh), ANY_ANGLE_RAD), known.status, *known.vertical,
+                    min(math.hypot(within, math.sqrt(turned)), ANY_ANGLE_RAD), known.status,
+                    *known.vertical,
                 )
             )  # fmt: skip
         return Estimate(time_s, tuple(nodes), self._pairs(), parameters=self._parameters(time_s))

@@ -341,6 +341,12 @@ class NeighbourhoodFilter:
         self._noise[nodes, 5] += sigma_rad**2
         self._behind = True
 
+    def diffuse(self, row: int, way_m: Floats, covariance: Floats) -> None:
+        """Move a node by ``way_m`` (2,), and add to the covariance (2, 2) of its place."""
+        self.state[row, :2] += way_m
+        self._noise[row, :3] += covariance[[0, 0, 1], [0, 1, 1]]
+        self._behind = True
+
     def sigma_of_terms(self) -> Floats:
         """Return the terms' standard deviations (T,)."""
         return np.asarray(np.sqrt(np.linalg.inv(self.terms_information).diagonal()), np.float64)
