@@ -25,14 +25,23 @@ RISES = np.linspace(-3.0, 3.0, 41)
 _LOG_PRIOR = -0.5 * RISES**2 - np.log(np.exp(-0.5 * RISES**2).sum())
 
 
-class Innovations(NamedTuple):
-    """Of N nodes' heights in each mode (N, MODES), before any common rise."""
+class CommonRises(NamedTuple):
+    """How well R common rises explain the heights of N nodes."""
 
-    mean_m: Floats
-    """NaN without news."""
-    variance_m2: Floats
-    duration_s: float
-    """Of the interval."""
+    rises_m: Floats
+    """The common rises (R,)."""
+    density: Floats
+    """Of each node's height in each mode (N, MODES, R)."""
+    news: npt.NDArray[np.bool_]
+    """Whether a node reported a height (N, 1)."""
+
+    def of_each(self, modes: Floats) -> Floats:
+        """Return how probable each node finds each rise (N, R), as a logarithm.
+
+        ``modes`` (N, MODES) are the probabilities of each one's modes in blown air.
+        """
+        density = (modes[:, :, None] * self.density).sum(axis=1)
+        return np.log(np.where(self.news, np.maximum(density, 1e-200), 1.0))
 
 
 class Others(NamedTuple):
@@ -46,14 +55,22 @@ class Others(NamedTuple):
     """Its variance."""
 
 
-def of_others(in_calm: Floats, blown: Innovations, modes: Floats) -> Others:
+def common_rises(off_m: Floats, variance_m2: Floats, duration_s: float) -> CommonRises:
+    """Try common rises on an interval's innovations in blown air (N, MODES); NaN without news."""
+    rises_m = RISES * FAN_M_S * duration_s
+    news = np.isfinite(off_m)
+    off_m = np.where(news, off_m, 0.0)[:, :, None] - FOLLOWS[:, None] * rises_m
+    return CommonRises(rises_m, normal_density(off_m, variance_m2[:, :, None]), news[:, :1])
+
+
+def of_others(in_calm: Floats, blown: CommonRises, modes: Floats) -> Others:
     """Return what the others say; ``in_calm`` (N, AIRS) is how probable each finds its own height.
 
     ``modes`` (N, MODES) are the probabilities of each one's modes in blown air.
     """
     own = np.log(np.maximum(in_calm, 1e-200))
     evidence = own.sum(axis=0) - own
-    rises_m, by_rise = _by_rise(blown, modes)
+    rises_m, by_rise = blown.rises_m, blown.of_each(modes)
     others = by_rise.sum(axis=0) - by_rise + _LOG_PRIOR
     highest = others.max(axis=1)
     density = np.exp(others - highest[:, None])
@@ -67,18 +84,8 @@ def of_others(in_calm: Floats, blown: Innovations, modes: Floats) -> Others:
     )
 
 
-def common_rise(blown: Innovations, modes: Floats) -> float:
+def common_rise(blown: CommonRises, modes: Floats) -> float:
     """Return how much the air let all heights rise (m), if it was blown, by what each did."""
-    rises_m, by_rise = _by_rise(blown, modes)
-    together = by_rise.sum(axis=0) + _LOG_PRIOR
+    together = blown.of_each(modes).sum(axis=0) + _LOG_PRIOR
     density = np.exp(together - together.max())
-    return float(density @ rises_m / density.sum())
-
-
-def _by_rise(blown: Innovations, modes: Floats) -> tuple[Floats, Floats]:
-    """Return common rises (R,) and how probable each node finds them (N, R): logarithms."""
-    rises_m = RISES * FAN_M_S * blown.duration_s
-    news = np.isfinite(blown.mean_m)
-    off_m = np.where(news, blown.mean_m, 0.0)[:, :, None] - FOLLOWS[:, None] * rises_m
-    density = (modes[:, :, None] * normal_density(off_m, blown.variance_m2[:, :, None])).sum(axis=1)
-    return rises_m, np.log(np.where(news[:, :1], np.maximum(density, 1e-200), 1.0))
+    return float(density @ blown.rises_m / density.sum())

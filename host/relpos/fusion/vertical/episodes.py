@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from relpos.fusion.estimator import Episode
 from relpos.fusion.normal import normal_density
-from relpos.fusion.vertical.air import FAN_M_S, Innovations, of_others
+from relpos.fusion.vertical.air import FAN_M_S, CommonRises, common_rises, of_others
 from relpos.fusion.vertical.modes import (
     AIRS,
     BEGINNINGS,
@@ -110,8 +110,8 @@ class Update(NamedTuple):
     """(N, airs * MODES), with what the others say of the air."""
     transition: Floats
     """(N, airs * MODES, airs * MODES)"""
-    blown: Innovations
-    """In blown air."""
+    blown: CommonRises | None
+    """What heights say of blown air; None for nodes of which each has an air of its own."""
 
 
 def begin(height_m: Floats, variance_m2: Floats, airs: int = AIRS) -> Beliefs:
@@ -194,9 +194,10 @@ def update(beliefs: Beliefs, interval: Interval) -> Update:
     usual = _usual(interval)[:, None]
     height_m, noise_m2 = interval.height_m[:, None, None], interval.variance_m2[:, None, None]
     off_m, total = height_m - mean, variance + noise_m2
-    blown = Innovations(off_m[:, -1], total[:, -1], interval.duration_s)
+    blown = None
     evidence = np.ones((nodes, airs))
     if airs == AIRS:
+        blown = common_rises(off_m[:, Air.BLOWN], total[:, Air.BLOWN], interval.duration_s)
         own = np.where(news, usual * normal_density(np.nan_to_num(off_m), total), 1.0)
         share = prior / np.maximum(prior.sum(axis=2, keepdims=True), 1e-300)
         others = of_others((share * own).sum(axis=2), blown, share[:, Air.BLOWN] * usual[:, 0])

@@ -15,6 +15,7 @@ Before anybody reports a height there is nothing here: the team is taken to be o
 from __future__ import annotations
 
 import math
+import statistics
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -127,6 +128,7 @@ class _Interval:
         mode = probability.sum(axis=1)
         blown = probability[:, Air.BLOWN]
         pressed = mode[:, PRESSURE].sum(axis=1)
+        assert self.update.blown is not None
         common_m = common_rise(self.update.blown, blown)
         felt = blown @ FOLLOWS
         climbed = felt - blown[:, Mode.LEVEL] - blown[:, Mode.JUMP]
@@ -395,13 +397,13 @@ class VerticalFilter:
         slow_m2 = heights.covariance[:, SLOW, SLOW]
         known = np.where(self._settled & (slow_m2 < VAGUE_M**2), bias_m, np.nan)
         pressed_m, shown = np.zeros(len(bias_m)), np.zeros(len(bias_m), dtype=np.bool_)
+        biases_m = known.tolist()
         for row in range(len(bias_m)):
-            others = np.delete(known, row)
-            others = others[np.isfinite(others)]
+            others = [m for k, m in enumerate(biases_m) if k != row and math.isfinite(m)]
             # Some who were all misled by a fan do not outvote those who were not.
-            shown[row] = others.size > 0 and 2 * others.size >= len(bias_m) - 1
+            shown[row] = len(others) > 0 and 2 * len(others) >= len(bias_m) - 1
             if shown[row]:
-                pressed_m[row] = np.median(others)
+                pressed_m[row] = statistics.median(others)
         # Of the bias, and of a height that is no longer reported.
         over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
         self._over = Over(heights.over_m - pressed_m, over_m2)
