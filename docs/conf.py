@@ -1,5 +1,6 @@
 """Configuration of Sphinx: `make docs` builds a site that loads nothing from other hosts."""
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "host"))
 
 from relpos import __version__  # noqa: E402
+
+# Nearly all of the pages' nodes stay: searched seldom for garbage, they cost a fifth less time.
+gc.set_threshold(50_000)
 
 project = "relpos"
 release = version = __version__
