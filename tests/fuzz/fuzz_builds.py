@@ -104,3 +104,11 @@ def totals(output):
     lines = [line for line in output.splitlines() if line.startswith("frames ")]
     assert lines, output[-4000:]
     return {name.strip(): int(count) for name, count in re.findall(r"([a-z ]+) (\d+)", lines[-1])}
+
+
+def check_that_only_the_crc_lets_noise_through(count):
+    """2^-16 of the noise passes the CRC by itself; the bound is that of six standard deviations."""
+    expected = count["noise"] / 2**16
+    assert count["crc of noise"] <= expected + 6 * expected**0.5 + 3
+    # Fewer of what is damaged: the CRC sees every one, two and three bits and every 16 in a row.
+    assert count["crc of mutants"] <= count["mutants"] / 2**16 + 10

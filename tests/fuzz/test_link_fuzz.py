@@ -27,13 +27,6 @@ def test_a_foreign_frame_changes_nothing_in_the_host():
     assert count["crc of mutants"] + count["crc of noise"] <= 5
 
 
-def check_that_only_the_crc_lets_noise_through(count):
-    """2^-16 of the noise passes the CRC by itself; the bound is that of six standard deviations."""
-    expected = count["noise"] / 2**16
-    assert count["crc of noise"] <= expected + 6 * expected**0.5 + 3
-    assert count["crc of mutants"] <= count["mutants"] / 2**16 + 10
-
-
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(4))
 def test_ten_million_random_frames_change_nothing_in_the_host(part):
@@ -43,7 +36,7 @@ def test_ten_million_random_frames_change_nothing_in_the_host(part):
     while count["frames"] < LONG_FRAMES // 4:
         link_fuzzer.run_one(source.randbytes(600), count)
     print(link_fuzzer.totals_line(count, start_s))
-    check_that_only_the_crc_lets_noise_through(count)
+    fuzz_builds.check_that_only_the_crc_lets_noise_through(count)
 
 
 @pytest.mark.soak
@@ -70,4 +63,4 @@ def test_a_million_frames_found_by_coverage_change_nothing_in_the_host(part, tmp
     print(result.stdout.splitlines()[-1])
     count = fuzz_builds.totals(result.stdout)
     assert count["frames"] >= GUIDED_FRAMES // 2
-    check_that_only_the_crc_lets_noise_through(count)
+    fuzz_builds.check_that_only_the_crc_lets_noise_through(count)

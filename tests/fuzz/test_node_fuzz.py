@@ -29,14 +29,6 @@ def run(program, *arguments, frames=None, timeout_s=None):
     return fuzz_builds.totals(result.stdout)
 
 
-def check_that_only_the_crc_lets_noise_through(count):
-    """2^-16 of the noise passes the CRC by itself; the bound is that of six standard deviations."""
-    expected = count["noise"] / 2**16
-    assert count["crc of noise"] <= expected + 6 * expected**0.5 + 3
-    # Fewer of what is damaged: the CRC sees every one, two and three bits and every 16 in a row.
-    assert count["crc of mutants"] <= count["mutants"] / 2**16 + 10
-
-
 def test_forty_thousand_frames_change_nothing_that_their_key_does_not_allow():
     count = run(fuzz_builds.build(fuzz_builds.RANDOM), 40_000, 1)
     assert count["frames"] >= 40_000
@@ -44,7 +36,7 @@ def test_forty_thousand_frames_change_nothing_that_their_key_does_not_allow():
     assert min(count["mutants"], count["forged"], count["obeyed"], count["refused"]) > 4_000
     assert count["restarts"] > 400
     assert count["noise"] > 1200
-    check_that_only_the_crc_lets_noise_through(count)
+    fuzz_builds.check_that_only_the_crc_lets_noise_through(count)
 
 
 @pytest.mark.soak
@@ -58,7 +50,7 @@ def test_ten_million_frames_found_by_coverage_change_nothing(tmp_path):
     options = ("-seed=1", "-max_len=800", "-len_control=0", f"-artifact_prefix={tmp_path}/")
     count = run(program, *options, corpus, frames=LONG_FRAMES)
     assert count["frames"] >= LONG_FRAMES
-    check_that_only_the_crc_lets_noise_through(count)
+    fuzz_builds.check_that_only_the_crc_lets_noise_through(count)
 
 
 @pytest.mark.soak
@@ -66,4 +58,4 @@ def test_ten_million_random_frames_change_nothing():
     count = run(fuzz_builds.build(fuzz_builds.RANDOM), LONG_FRAMES, 2)
     assert count["noise"] / 2**16 > 5  # enough to compare
     assert count["crc of noise"] >= 1
-    check_that_only_the_crc_lets_noise_through(count)
+    fuzz_builds.check_that_only_the_crc_lets_noise_through(count)

@@ -8,7 +8,7 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -31,6 +31,7 @@ from relpos.live.team_view import Alert, TeamView
 from relpos.runs import read_estimates
 from relpos.tracks import estimated_tracks
 from support.team_views import NAMES, PLACES, UNIX_S, team_view
+from support.waiting import until
 
 PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)
 FRAME = MapFrame(48.1, 11.5, math.radians(90.0), 520.0)
@@ -317,13 +318,6 @@ def test_a_pin_on_a_node_waits_for_it() -> None:
     # It stays where it was put.
     moved = {2: {"x_m": 99.0}}
     assert pinned.update(team_view(8, changes=moved)) is frame
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    deadline = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.02)
 
 
 class Server:

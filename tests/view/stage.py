@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from playwright.sync_api import Browser, Page, Playwright, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 from walking_team import WalkingTeam
 
 from relpos.live.board import BOARD_EVENTS, Board
@@ -201,6 +201,11 @@ def wait_for(condition: Callable[[], bool], within_s: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+def wait_live(page: Page) -> None:
+    """Wait until the page shows that its connection is there."""
+    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
+
+
 def until_held(page: Page) -> None:
     """Wait until a button that is held down has acted, which it does by itself."""
     wait_for(lambda: page.locator(".holding").count() == 0)
@@ -215,4 +220,5 @@ __all__ = [
     "sync_playwright",
     "until_held",
     "wait_for",
+    "wait_live",
 ]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from stage import Stage, wait_for
+from stage import Stage, wait_for, wait_live
 
 SOUNDS = """
     window.tones = [];
@@ -64,10 +64,6 @@ OVERLAPPING = """() => {
         .map(([b]) => `${a} and ${b}`));
 }"""
 LIVE_WORDS = re.compile(r"\b(now|live|moves|node OK|located|warmer|colder)\b", re.IGNORECASE)
-
-
-def wait_live(page: Page) -> None:
-    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
 
 
 def texts(page: Page, selector: str) -> str:

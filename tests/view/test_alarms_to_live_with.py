@@ -7,8 +7,8 @@ import re
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
-from stage import Stage, wait_for
+from playwright.sync_api import expect
+from stage import Stage, wait_for, wait_live
 from walking_team import NAMES, WalkingTeam, disk_full
 
 from relpos.live.team_view import Level, LogEntry, Notice
@@ -40,10 +40,6 @@ RENDER = """async (kind) => {
     return { pulses, hertz, every: PATTERNS[kind].everyS,
         harmonics: [1, 2, 3, 4, 5].map((n) => strength(n * hertz)) };
 }"""
-
-
-def wait_live(page: Page) -> None:
-    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
 
 
 def test_each_sound_has_the_pulses_of_its_priority(visit: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from stage import Stage, wait_for
+from stage import Stage, wait_for, wait_live
 from walking_team import WalkingTeam, disk_full
 
 # Colours on the canvas, at places given in CSS pixels from its centre.
@@ -43,8 +43,8 @@ def colour_of(page: Page, node: int) -> list[int]:
     return rgb(card(page, node).locator(".disc").evaluate("e => getComputedStyle(e).background"))
 
 
-def wait_live(page: Page) -> None:
-    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
+def wait_for_people(page: Page) -> None:
+    wait_live(page)
     expect(page.locator("#people li").first).to_be_visible()
 
 
@@ -73,7 +73,7 @@ def find_button(page: Page, name: str) -> Any:
 
 def test_the_followed_person_stays_in_the_middle_while_the_map_moves(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     follow(page, 2)
     beside = [[-7, 0], [7, 0]]
     ben = colour_of(page, 2)
@@ -89,7 +89,7 @@ def test_the_followed_person_stays_in_the_middle_while_the_map_moves(visit, stag
 
 def test_heading_up_points_the_followed_persons_marker_upwards_on_every_side(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.get_by_role("button", name="Follow Anna").first.click()
     anna = colour_of(page, 1)
     # The marker's disc has a radius of 11, its point is 11 longer.
@@ -107,7 +107,7 @@ def test_heading_up_points_the_followed_persons_marker_upwards_on_every_side(vis
 def test_north_is_up_and_named_once_compasses_have_reported_it(visit, stage: Stage):
     stage.frozen = True
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.get_by_role("button", name="Follow Anna").first.click()
     anna = colour_of(page, 1)
     heading = stage.team.pose(1, stage.at_s)[2]
@@ -128,7 +128,7 @@ def test_north_is_up_and_named_once_compasses_have_reported_it(visit, stage: Sta
 
 def test_the_map_zooms_by_wheel_buttons_keys_and_two_fingers(visit, stage: Stage):
     page = visit(has_touch=True)
-    wait_live(page)
+    wait_for_people(page)
     wait_for(lambda: metres_across(page) > 20)
 
     def zoomed(action) -> None:
@@ -172,7 +172,7 @@ def test_the_map_zooms_by_wheel_buttons_keys_and_two_fingers(visit, stage: Stage
 
 def test_dragging_ends_following(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     follow(page, 2)
     expect(page.locator("#follow")).to_have_attribute("aria-pressed", "true")
     box = page.locator("#map").bounding_box()
@@ -186,7 +186,7 @@ def test_dragging_ends_following(visit, stage: Stage):
 def test_a_touch_on_somebodys_marker_chooses_that_person(visit, stage: Stage):
     stage.frozen = True
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     follow(page, 5)
     card(page, 5).locator(".name").click()
     ben = colour_of(page, 5)
@@ -198,7 +198,7 @@ def test_a_touch_on_somebodys_marker_chooses_that_person(visit, stage: Stage):
 
 def test_nothing_is_drawn_while_nothing_changes(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.evaluate(COUNT_FRAMES)
     wait_for(lambda: page.evaluate("window.frames_drawn") > 3)
     stage.mute = True
@@ -229,7 +229,7 @@ def test_distance_and_direction_from_me_are_those_of_the_team(visit, stage: Stag
     while any(abs(value % 1.0 - 0.5) < 0.1 for look in looks for value in seen(*look)):
         stage.at_s += 0.1
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     for me, other in looks:
         page.locator("#me").select_option(str(me))
         digits, hour, point = map(round, seen(me, other))
@@ -246,7 +246,7 @@ def test_distance_and_direction_from_me_are_those_of_the_team(visit, stage: Stag
 def test_health_is_shown_by_a_word_and_a_shape_and_its_reason(visit, stage: Stage):
     stage.team.health = {2: ("yellow", ("weak radio (-88 dBm)",)), 3: ("red", ("supply 4.10 V",))}
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     shapes = set()
     for node, word, reason in (
         (1, "node OK", ""),
@@ -264,7 +264,7 @@ def test_health_is_shown_by_a_word_and_a_shape_and_its_reason(visit, stage: Stag
 
 def test_a_lost_person_raises_an_alarm_and_is_announced_when_found(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     stage.team.lost_since[5] = stage.at_s - 4.5
     alarm = page.locator("#alarms .rows .alarm")
     expect(alarm).to_contain_text("Emil is lost: not heard for")
@@ -281,7 +281,7 @@ def test_standing_still_warns_then_alarms_until_acknowledged_on_every_page(visit
     stage.frozen = True
     stage.team.still_since[2] = stage.at_s - 17.0
     page, other = visit(), visit()
-    wait_live(page)
+    wait_for_people(page)
     expect(page.locator("#alarms")).to_be_hidden()
     stage.at_s += 4.0
     alarm = page.locator("#alarms .rows .alarm")
@@ -309,7 +309,7 @@ def test_many_alarms_at_once_leave_room_for_the_map_and_are_acknowledged_togethe
     stage.team = WalkingTeam(size=12)
     stage.team.still_since = {n: stage.at_s - 22.0 - 2 * n for n in range(1, 10)}
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     rows = page.locator("#alarms .rows .alarm")
     # All that are high are shown, whoever they are.
     expect(rows).to_have_count(6)
@@ -337,7 +337,7 @@ def test_alarms_sound_until_acknowledged(visit, stage: Stage):
         };
     """
     page = visit(init=listen)
-    wait_live(page)
+    wait_for_people(page)
     expect(page.locator("#sound")).to_have_text("NO SOUND: enable")
     page.locator("#sound").click()
     expect(page.locator("#sound")).to_have_text("Sound on")
@@ -366,7 +366,7 @@ def test_an_ambiguous_estimate_shows_the_other_positions_and_their_probabilities
     stage.team.ambiguous, stage.team.ring = 3, 6
     stage.frozen = True
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     expect(card(page, 3).locator(".state")).to_contain_text("Ambiguous: 62 % where shown")
     expect(card(page, 6).locator(".state")).to_have_text("Not located yet")
     expect(page.locator("#map-hint")).to_have_text("Not located yet: Fatima")
@@ -384,7 +384,7 @@ def test_names_are_text_whatever_is_in_them(visit, stage: Stage):
     name = "<img src=x onerror=alert(1)>"
     stage.team.names[2] = name
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     expect(card(page, 2).locator(".label")).to_have_text(name)
     assert page.locator("#people img").count() == 0
 
@@ -394,7 +394,7 @@ def test_names_are_text_whatever_is_in_them(visit, stage: Stage):
 
 def test_find_leads_by_arrow_distance_and_words(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     find_button(page, "Chloé").click()
     find = page.locator("#find")
     expect(find.get_by_role("heading")).to_have_text("Anna → Chloé")
@@ -427,7 +427,7 @@ def test_find_leads_by_arrow_distance_and_words(visit, stage: Stage):
 def test_find_says_that_the_direction_is_unknown(visit, stage: Stage):
     stage.team.ring = 1
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.locator("#me").select_option("1")
     find_button(page, "Ben").click()
     expect(page.locator("#find .order")).to_have_text("position unknown")
@@ -440,7 +440,7 @@ def test_find_says_that_the_direction_is_unknown(visit, stage: Stage):
 
 def test_a_server_that_is_gone_is_reported_and_found_again_without_reloading(visit, stage: Stage):
     page = visit(expect_gone=True)
-    wait_live(page)
+    wait_for_people(page)
     page.evaluate("window.same_page = true")
     stage.shut()
     connection = page.locator("#connection")
@@ -456,7 +456,7 @@ def test_a_server_that_is_gone_is_reported_and_found_again_without_reloading(vis
 def test_a_laptop_that_slept_for_a_minute_is_connected_anew_when_it_wakes(visit, stage: Stage):
     page = visit(expect_gone=True)
     page.clock.install()
-    wait_live(page)
+    wait_for_people(page)
     page.evaluate("window.same_page = true")
     x_before = stage.team.pose(1, stage.at_s)
     # Behind a closed lid no timer runs, and the server gives the connection up.
@@ -475,7 +475,7 @@ def test_a_laptop_that_slept_for_a_minute_is_connected_anew_when_it_wakes(visit,
 
 def test_silence_of_the_server_is_reported_before_the_connection_breaks(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     # Its process stands still: not even pings come.
     process = stage.web._process
     assert process is not None
@@ -492,7 +492,7 @@ def test_silence_of_the_server_is_reported_before_the_connection_breaks(visit, s
 
 def test_a_page_without_the_token_says_where_to_find_it(visit, stage: Stage):
     page = visit(expect_gone=True)
-    wait_live(page)
+    wait_for_people(page)
     stage.shut()
     page.context.clear_cookies()
     stage.open()
@@ -503,7 +503,7 @@ def test_ten_pages_at_once_all_stay_live(visit, stage: Stage):
     first = visit(viewport={"width": 400, "height": 300})
     pages = [first, *(visit(context=first.context) for _ in range(9))]
     for page in pages:
-        wait_live(page)
+        wait_for_people(page)
         page.evaluate(COUNT_FRAMES)
     for page in pages:
         page.bring_to_front()
@@ -516,7 +516,7 @@ def test_ten_pages_at_once_all_stay_live(visit, stage: Stage):
 
 def test_everything_can_be_done_with_the_keyboard_alone(visit, stage: Stage):
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.keyboard.press("Tab")
     expect(page.locator(".skip")).to_be_focused()
     reached, unseen = [], []
@@ -594,7 +594,7 @@ def test_everything_has_a_name_and_enough_contrast(visit, stage: Stage):
     stage.team.health = {3: ("yellow", ("weak radio",))}
     stage.team.notices = (disk_full(),)
     page = visit(reduced_motion="reduce")
-    wait_live(page)
+    wait_for_people(page)
     page.locator("#layers summary").click()
     page.get_by_role("button", name="Table").click()
     find_button(page, "Chloé").click()
@@ -613,7 +613,7 @@ def test_everything_has_a_name_and_enough_contrast(visit, stage: Stage):
 def test_a_table_states_what_the_map_shows(visit, stage: Stage):
     stage.frozen = True
     page = visit()
-    wait_live(page)
+    wait_for_people(page)
     page.get_by_role("button", name="Table").click()
     x, y, _ = stage.team.pose(4, stage.at_s)
     row = page.locator("#table tr", has=page.locator("th", has_text="Dmitri"))
@@ -644,7 +644,7 @@ def test_a_table_states_what_the_map_shows(visit, stage: Stage):
 def test_it_fits_screens_from_a_small_phone_to_a_wall(visit, stage: Stage, width: int, height: int):
     stage.team.still_since = {2: stage.at_s - 60.0}
     page = visit(viewport={"width": width, "height": height})
-    wait_live(page)
+    wait_for_people(page)
     assert overflow(page) <= 0
     box = page.locator("#map").bounding_box()
     assert box["width"] >= 300
@@ -662,7 +662,7 @@ def test_it_fits_screens_from_a_small_phone_to_a_wall(visit, stage: Stage, width
 
 def test_the_theme_follows_the_system_until_somebody_chooses(visit, stage: Stage):
     page = visit(color_scheme="dark")
-    wait_live(page)
+    wait_for_people(page)
     ground = "getComputedStyle(document.body).backgroundColor"
     assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.emulate_media(color_scheme="light")
@@ -670,7 +670,7 @@ def test_the_theme_follows_the_system_until_somebody_chooses(visit, stage: Stage
     page.get_by_role("button", name="Dark theme").click()
     assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.reload()
-    wait_live(page)
+    wait_for_people(page)
     assert rgb(page.evaluate(ground)) == [11, 16, 22]
     wait_for(lambda: page.evaluate(PIXELS, [[-300, 250]])[0][0] < 40)
 
@@ -679,7 +679,7 @@ def test_nothing_moves_with_reduced_motion(visit, stage: Stage):
     stage.team.still_since = {2: stage.at_s - 60.0}
     stage.frozen = True
     page = visit(reduced_motion="reduce")
-    wait_live(page)
+    wait_for_people(page)
     expect(page.locator("#alarms .rows .alarm")).to_be_visible()
     assert page.evaluate("document.getAnimations().length") == 0
     stage.mute = True
@@ -691,7 +691,7 @@ def test_nothing_moves_with_reduced_motion(visit, stage: Stage):
 
 def test_help_and_the_phones_code_open_and_close_by_keyboard(visit, stage: Stage):
     page = visit(expect_gone=True)
-    wait_live(page)
+    wait_for_people(page)
     page.locator("#help").focus()
     page.keyboard.press("Enter")
     expect(page.get_by_role("dialog")).to_contain_text("Legend")

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +23,7 @@ from relpos.view.keys import has_keys, raw_keys
 from relpos.view.terminal import TerminalView
 from relpos.view.text_page import Canvas, RenderOptions, page
 from support.team_views import team_view
+from support.waiting import until
 
 STILL = {"alert": Alert.STILL_ALARM, "still_s": 33.0, "moving": False}
 
@@ -285,13 +286,6 @@ class Screen:
         ):
             rows[int(number) - 1] = re.sub(r"\x1b\[[\d;]*m", "", text).rstrip("\a")
         return rows
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    deadline = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.02)
 
 
 @pytest.fixture
