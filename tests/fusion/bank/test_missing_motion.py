@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 from dataclasses import replace
 
 import numpy as np
@@ -64,3 +65,41 @@ def test_reports_that_say_nothing_of_where_they_lead_do_not_hold_up_the_estimate
     # Each search costs as much as a hundred ranges, and each range could begin one.
     assert result.counters["nodes_sought_again"] <= len(run.node_ids) * (40 + 10)
     assert all(n.status is not NodeStatus.OK for e in result.estimates[5:] for n in e.nodes)
+
+
+@pytest.mark.parametrize("off_s", [5, 8])
+def test_a_node_that_was_off_for_seconds_is_not_ok_where_its_next_report_alone_leads(
+    off_s: int,
+) -> None:
+    # It walked seven metres meanwhile; its first report afterwards is of one second.
+    run = relpos.simulate("mission-base", 1000, seconds=120, reboot_s=off_s)
+    back_s = 60.0 + off_s
+    true = {(t.time_s, t.node): np.array([t.x_m, t.y_m]) for t in run.truth}
+    for e in relpos.fuse(run).estimates:
+        if not back_s - 1.0 < e.time_s < back_s + 10.0:
+            continue
+        at_s = float(round(e.time_s))
+        for pair, status in zip(e.pairs, e.pair_statuses(), strict=True):
+            distance_m = float(np.linalg.norm(true[at_s, pair.node] - true[at_s, pair.peer]))
+            # Up to half a second of walking of both lies between the two times.
+            assert status is not NodeStatus.OK or abs(pair.distance_m - distance_m) < 2.0
+
+
+def test_a_gap_in_all_data_is_no_restart_and_the_reports_after_it_count() -> None:
+    run = relpos.simulate("mission-base", 2001, seconds=80)
+    kept, way, turned = [], dict.fromkeys(run.node_ids, 0j), dict.fromkeys(run.node_ids, 0.0)
+    for m in run.measurements:
+        missing = 60.0 <= m.time_s < 66.0
+        if isinstance(m, Motion):
+            # The first report after the gap has the sum.
+            step = complex(m.dx_m, m.dy_m) * cmath.rect(1.0, turned[m.node])
+            way[m.node], turned[m.node] = way[m.node] + step, turned[m.node] + m.dtheta_rad
+            if not missing:
+                dx_m, dy_m = way[m.node].real, way[m.node].imag
+                kept.append(replace(m, dx_m=dx_m, dy_m=dy_m, dtheta_rad=turned[m.node]))
+                way[m.node], turned[m.node] = 0j, 0.0
+        elif not missing:
+            kept.append(m)
+    result = relpos.fuse(replace(run, measurements=tuple(kept)))
+    afterwards = [e for e in result.estimates if e.time_s > 68.0]
+    assert all(status is NodeStatus.OK for e in afterwards for status in e.pair_statuses())

@@ -114,6 +114,11 @@ class WithinReport:
         most_m = duration_s / fraction * min(speed * slack, abs(speed - self._before_m_s))
         self.variance_m2 = 0.5 * (4.0 * self._done * (1.0 - self._done) * most_m) ** 2
 
+    @property
+    def ended(self) -> bool:
+        """Whether it is where a report ends."""
+        return self._done == 0.0
+
     def range_variance_m2(self) -> float:
         """Add a range; return the variance by which it counts as less exact."""
         self._ranges += 1
@@ -122,6 +127,10 @@ class WithinReport:
 
 WALK_M_S, WALK_S = 1.0, 4.0
 """Speed of a person of whom no motion is reported, and how long it keeps its direction."""
+
+
+SLOW = 0.5
+"""A long report of less than this share of a node's usual speed may leave out most of its way."""
 
 
 def unseen_variance(duration_s: float) -> float:
