@@ -41,7 +41,7 @@ from relpos.fusion.initial_poses import (
 )
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
-from relpos.fusion.models.motion import SLOW, WALK_S, WithinReport, reported_sigmas, velocity_m_s
+from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
@@ -69,6 +69,9 @@ SET_OFF_M = 0.3
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading without a reported sigma: magnetic ones indoors are 10 degrees off."""
 
+
+SLOW = 0.5
+"""A report of less than this share of a node's usual speed may leave out most of its way."""
 
 USUAL_RANGES = 3
 """A node that was ranged so often in as long before, and then never, is silent."""

@@ -129,10 +129,6 @@ WALK_M_S, WALK_S = 1.0, 4.0
 """Speed of a person of whom no motion is reported, and how long it keeps its direction."""
 
 
-SLOW = 0.5
-"""A long report of less than this share of a node's usual speed may leave out most of its way."""
-
-
 def unseen_variance(duration_s: float) -> float:
     """Return the variance (m^2, both axes) of the way that a person walks unseen.
 
