@@ -7,8 +7,8 @@ files nor ports nor the truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import combinations
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.models.unseen_walk import UnseenWalk
+from relpos.fusion.models.motion import WALK_S, WithinReport
+from relpos.fusion.models.unseen_walk import AXIS_M2_S2, UnseenWalk
+from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement
 
 Floats = npt.NDArray[np.float64]
@@ -276,6 +278,13 @@ def by_silence(epochs: int) -> NodeStatus:
     return NodeStatus.STALE if epochs >= STALE_EPOCHS else NodeStatus.OK
 
 
+SLOW = 0.5
+"""A report of less than this share of a node's usual speed may leave out most of its way."""
+
+USUAL_RANGES = 3
+"""A node that was ranged so often in as long before, and then never, is silent."""
+
+
 @dataclass(slots=True)
 class Presence:
     """What every estimator keeps of a node beside its pose: its height, and its last motion."""
@@ -285,15 +294,16 @@ class Presence:
     """Forward and left, by its newest displacement."""
     news_s: float = -inf
     silent_epochs: int = 0
+    within: WithinReport = field(default_factory=WithinReport)
+    begun_s: float = -inf
+    before_s: float = -inf
+    """When its present report began, and the one before."""
+    ranges_s: tuple[float, ...] = (-inf,) * USUAL_RANGES
+    """Times of its last ranges."""
     unseen: UnseenWalk | None = None
     """How it walked while its motion was missing last."""
     diffused_s: float = -inf
     """Until then it may have walked without a report, and its ranges have moved it."""
-
-    @property
-    def uneven_m2(self) -> float:
-        """Variance (m^2, along any one direction) of where it is within its report."""
-        return 0.0
 
     def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
         """Return its heading and the deviation, which are known but for what it turned unseen."""
@@ -305,6 +315,38 @@ class Presence:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:
             self.news_s = time_s
+
+    def ranged(self, time_s: float) -> None:
+        """Note that a range of the node was used."""
+        self.received(time_s)
+        self.ranges_s = (*self.ranges_s[1:], time_s)
+
+    def move(self, a: Advance, usual_m_s: float, team: Iterable[Presence]) -> None:
+        """Note a piece of a report of a node that usually moves at ``usual_m_s``.
+
+        A node that is silent within a slow report restarts, and tells less than it walks. It was
+        ranged before, and others report meanwhile: not all data are missing.
+        """
+        way_m = hypot(a.dx_m, a.dy_m)
+        if self.within.ended:
+            self.before_s, self.begun_s = self.begun_s, a.time_s - a.duration_s
+        self.within.move(way_m, a.duration_s, a.fraction, usual_m_s)
+        heard_s = max(self.begun_s, self.ranges_s[-1])
+        silent_s = a.time_s - heard_s
+        if silent_s <= WALK_S or self._walks_unseen or self.ranges_s[0] <= heard_s - silent_s:
+            return
+        others = any(other.before_s > heard_s + 0.25 * silent_s for other in team)
+        if others and way_m < SLOW * usual_m_s * a.duration_s:
+            self.unseen = UnseenWalk(heard_s, np.zeros(2), AXIS_M2_S2 * np.eye(2))
+            self.diffused_s = heard_s
+
+    @property
+    def _walks_unseen(self) -> bool:
+        return self.unseen is not None and self.diffused_s >= self.begun_s
+
+    def leads_nowhere(self, a: Advance) -> bool:
+        """Return whether a report came too late, and is too long, to say where its end led to."""
+        return a.duration_s > WALK_S * a.fraction and self._walks_unseen
 
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""

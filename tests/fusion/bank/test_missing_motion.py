@@ -67,12 +67,12 @@ def test_reports_that_say_nothing_of_where_they_lead_do_not_hold_up_the_estimate
     assert all(n.status is not NodeStatus.OK for e in result.estimates[5:] for n in e.nodes)
 
 
-@pytest.mark.parametrize("off_s", [5, 8])
+@pytest.mark.parametrize(("off_s", "nodes", "seed"), [(5, 6, 1000), (8, 6, 1000), (8, 24, 11)])
 def test_a_node_that_was_off_for_seconds_is_not_ok_where_its_next_report_alone_leads(
-    off_s: int,
+    off_s: int, nodes: int, seed: int
 ) -> None:
     # It walked seven metres meanwhile; its first report afterwards is of one second.
-    run = relpos.simulate("mission-base", 1000, seconds=120, reboot_s=off_s)
+    run = relpos.simulate("mission-base", seed, nodes=nodes, seconds=120, reboot_s=off_s)
     back_s = 60.0 + off_s
     true = {(t.time_s, t.node): np.array([t.x_m, t.y_m]) for t in run.truth}
     for e in relpos.fuse(run).estimates:

@@ -41,7 +41,7 @@ from relpos.fusion.initial_poses import (
 )
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
-from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
+from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
@@ -54,7 +54,7 @@ from relpos.fusion.models.ranging import (
     slab_variance,
     slant_height,
 )
-from relpos.fusion.models.unseen_walk import AXIS_M2_S2, UnseenWalk
+from relpos.fusion.models.unseen_walk import UnseenWalk
 from relpos.fusion.post import posts_of
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
@@ -70,39 +70,12 @@ HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading without a reported sigma: magnetic ones indoors are 10 degrees off."""
 
 
-SLOW = 0.5
-"""A report of less than this share of a node's usual speed may leave out most of its way."""
-
-USUAL_RANGES = 3
-"""A node that was ranged so often in as long before, and then never, is silent."""
-
-
 @dataclass(slots=True)
 class _Known(Presence):
     """What is kept of a node beside its hypotheses."""
 
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
-    within: WithinReport = field(default_factory=WithinReport)
-    begun_s: float = -math.inf
-    before_s: float = -math.inf
-    """When its present report began, and the one before."""
-    ranges_s: tuple[float, ...] = (-math.inf,) * USUAL_RANGES
-    """Times of its last ranges."""
-
-    @property
-    def uneven_m2(self) -> float:
-        return self.within.variance_m2
-
-    @property
-    def walks_unseen(self) -> bool:
-        """Whether its present report came too late, or says nothing of where it is."""
-        return self.unseen is not None and self.diffused_s >= self.begun_s
-
-    def ranged(self, time_s: float) -> None:
-        """Note that a range of the node was used."""
-        self.received(time_s)
-        self.ranges_s = (*self.ranges_s[1:], time_s)
 
 
 @dataclass(slots=True)
@@ -232,7 +205,7 @@ class Bank:
         knowns, zero_motion, speed_gate = self._known, self.zero_motion, self.speed_gate
         self._moved = True
         for k, a in enumerate(steps):
-            time_s, node, duration_s, dx_m, dy_m, turn_rad, fraction = a[:7]
+            time_s, node, duration_s, dx_m, dy_m, turn_rad = a[:6]
             known = knowns[node]
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
@@ -241,14 +214,9 @@ class Bank:
             self.turn_agreement.move(a)
             known.velocity_m_s = velocity_m_s(a)
             usual = speed_gate.usual_m_s.get(node, 0.0)
-            if known.within.ended:
-                known.before_s, known.begun_s = known.begun_s, time_s - duration_s
-            known.within.move(way_m, duration_s, fraction, usual)
-            if way_m < SLOW * usual * duration_s:
-                self._find_restart(known, time_s)
+            known.move(a, usual, knowns.values())
             # How it turned meanwhile its ranges cannot say.
-            if duration_s > WALK_S * fraction and known.walks_unseen:
-                # So long a report says nothing of where its end led to.
+            if known.leads_nowhere(a):
                 moves[k, :2] = 0.0
                 self._walk_unseen(node, time_s)
             else:
@@ -270,19 +238,6 @@ class Bank:
             self._make(rows, moves, reported, slice(begin, len(steps)))
         else:
             self.core.move(rows, moves, reported)
-
-    def _find_restart(self, known: _Known, time_s: float) -> None:
-        """Let a node walk unseen that is silent within a slow report: it tells less than it walks.
-
-        It was ranged before, and others report meanwhile: not all data are missing.
-        """
-        heard_s = max(known.begun_s, known.ranges_s[-1])
-        silent_s = time_s - heard_s
-        if silent_s <= WALK_S or known.walks_unseen or known.ranges_s[0] <= heard_s - silent_s:
-            return
-        if any(other.before_s > heard_s + 0.25 * silent_s for other in self._known.values()):
-            known.unseen = UnseenWalk(heard_s, np.zeros(2), AXIS_M2_S2 * np.eye(2))
-            known.diffused_s = heard_s
 
     def _move_doubtful(self, rows: Indices, moves: Floats, reported: Floats | None, k: int) -> None:
         """Make displacement ``k``, which is far out of its node's habit, in half the hypotheses."""

@@ -251,7 +251,7 @@ class Report:
         moments = pair_moments(self.mean[places], covariance)
         i, k = every_pair(len(nodes))
         distances, sigmas = self.distances
-        own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
+        own_m2 = np.array([self.presence[node].within.variance_m2 for node in nodes])
         scale_m = self._range_scale_sd() * distances
         sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k] + scale_m**2)
         # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.

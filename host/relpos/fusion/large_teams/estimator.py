@@ -36,7 +36,7 @@ from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, prior_information
 from relpos.fusion.large_teams.variance_components import VarianceComponents
-from relpos.fusion.models.motion import WALK_S, reported_sigmas, velocity_m_s
+from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
@@ -257,7 +257,9 @@ class LargeTeam:
         """Apply the displacements since the last call."""
         steps, self._pending = self._pending, []
         for a in steps:
-            self._known[a.node].velocity_m_s = velocity_m_s(a)
+            known = self._known[a.node]
+            known.velocity_m_s = velocity_m_s(a)
+            known.move(a, WALK_M_S, self._known.values())
             self._correlation.move(a.node, math.hypot(a.dx_m, a.dy_m), a.dtheta_rad)
         self._move(steps)
 
@@ -272,8 +274,7 @@ class LargeTeam:
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
         for a, move in zip(steps, moves, strict=True):
-            if self._known[a.node].unseen is not None and a.duration_s > WALK_S * a.fraction:
-                # So long a report says nothing of where its end led to.
+            if self._known[a.node].leads_nowhere(a):
                 move[:2] = 0.0
                 self._walk_unseen(a.node, a.time_s)
             else:
@@ -318,7 +319,7 @@ class LargeTeam:
         ends = nodes_of(step.ranges)
         self._diffuse(ends, step.time_s, timeline)
         for node in ends:
-            self._presence(node).received(step.time_s)
+            self._presence(node).ranged(step.time_s)
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
