@@ -305,6 +305,10 @@ class Presence:
     diffused_s: float = -inf
     """Until then it may have walked without a report, and its ranges have moved it."""
 
+    def velocity_at(self, time_s: float) -> tuple[float, float]:
+        """Return its velocity forward and left (m/s); 0 where its motion is missing."""
+        return (0.0, 0.0) if self.diffused_s >= time_s else self.velocity_m_s
+
     def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
         """Return its heading and the deviation, which are known but for what it turned unseen."""
         if self.unseen is None or self.diffused_s < time_s:

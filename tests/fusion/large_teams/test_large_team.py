@@ -242,7 +242,7 @@ def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges()
 
 
 def test_people_of_a_large_team_walk_on_while_their_motion_is_missing_and_face_their_way() -> None:
-    run = relpos.simulate("mission-gap-20", 11, nodes=LARGE_TEAM + 1, seconds=60)
+    run = relpos.simulate("mission-gap-20", 11, nodes=LARGE_TEAM + 1, seconds=45)
     result = relpos.fuse(run)
     scored = relpos.evaluate(result, run, bound=False).metrics
     # Who has not reported yet is taken to stand.

@@ -276,8 +276,9 @@ class Bank:
         rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
             repeats = self._repeats(pairs)
+            known = self._known
             velocity = [
-                self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
+                known[a].velocity_at(time_s) + known[b].velocity_at(time_s) for a, b in pairs
             ]
             outliers = self.outliers.expected(time_s, pairs)
             before = self._unseen(ends, time_s)
@@ -309,11 +310,6 @@ class Bank:
         variance = self.core.range_variance_m2
         count, kept = self.range_correlation.repeats(pairs)
         return Repeats(variance * count / (variance + count * own_m2), kept)
-
-    def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
-        """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""
-        known = self._known[node]
-        return (0.0, 0.0) if known.diffused_s >= time_s else known.velocity_m_s
 
     def _climb(self, time_s: float) -> None:
         """Update heights at the end of an epoch; take back what stairs have added to motion."""

@@ -342,7 +342,7 @@ class LargeTeam:
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
             apart_m = float(distance[k])
-            velocities = [known.velocity_m_s for known in ends]
+            velocities = [known.velocity_at(time_s) for known in ends]
             slopes = slopes_of((sight[k][0], sight[k][1]), apart_m, headings[k], velocities)
             excess_m = horizontal_m - apart_m
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
