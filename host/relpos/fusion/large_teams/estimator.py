@@ -465,9 +465,9 @@ class LargeTeam:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
-        relative, common = self.filter.marginals(), self.filter.common_marginals()
-        own, turned = (relative + common).tolist(), float(self.filter.common[2, 2])
-        pose = self.filter.pose.tolist()
+        own, common = self.filter.marginals(), self.filter.common_marginals()
+        places, headings_rad2 = (own[:, :3] + common[:, :3]).tolist(), own[:, 3].tolist()
+        turned_rad, pose = math.sqrt(self.filter.common[2, 2]), self.filter.pose.tolist()
         nodes = []
         for node in sorted(self._known):
             known = self._known[node]
@@ -475,13 +475,12 @@ class LargeTeam:
             if row is None:
                 nodes.append(unlocated(node, known.vertical))
                 continue
-            xx, yy, xy, hh = own[row]
-            x, y, heading = pose[row]
-            heading, within = known.facing(time_s, heading, math.sqrt(hh - turned))
+            (x, y, heading), (xx, yy, xy) = pose[row], places[row]
+            heading, sigma = known.facing(time_s, heading, math.sqrt(headings_rad2[row]))
             nodes.append(
                 NodeEstimate(
                     node, x, y, math.remainder(heading, 2.0 * math.pi), xx, yy, xy,
-                    min(math.hypot(within, math.sqrt(turned)), ANY_ANGLE_RAD), known.status,
+                    min(math.hypot(sigma, turned_rad), ANY_ANGLE_RAD), known.status,
                     *known.vertical,
                 )
             )  # fmt: skip
