@@ -189,7 +189,8 @@ class LargeTeam:
                 self._climb(step.time_s)
                 self._diffuse(self._row, step.time_s, timeline)
                 self._add_found(self.initialiser.find(step.time_s))
-                if len(self._row) > 1:
+                if self._reach_m > 0.0:
+                    # Before any range nothing seems to measure it, and all are in one strip still.
                     self.filter.take_out_common_motion()
                 self._slew_clocks(step.time_s, timeline)
                 return self._estimate(step.time_s)
@@ -393,7 +394,7 @@ class LargeTeam:
         ``place_m`` (N, 2) and ``prior`` (N, 4) were the places and marginals before.
         """
         posterior = self.filter.marginals()
-        for node in sorted({node for pair in pairs for node in pair}):
+        for node in {node for pair in pairs for node in pair}:
             known, row = self._known[node], self._row[node]
             if known.unseen is not None and known.diffused_s >= time_s:
                 moved_m = self.filter.pose[row, :2] - place_m[row]
