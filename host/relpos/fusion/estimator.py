@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.models.motion import WALK_S, WithinReport
+from relpos.fusion.models.odometry_faults import STILL_M_S
 from relpos.fusion.models.unseen_walk import AXIS_M2_S2, UnseenWalk
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement
@@ -304,6 +305,8 @@ class Presence:
     """How it walked while its motion was missing last."""
     diffused_s: float = -inf
     """Until then it may have walked without a report, and its ranges have moved it."""
+    carried_s: float = inf
+    """Since then its ranges contradict that it stands, which is all that it reports."""
 
     def velocity_at(self, time_s: float) -> tuple[float, float]:
         """Return its velocity forward and left (m/s); 0 where its motion is missing."""
@@ -332,6 +335,8 @@ class Presence:
         ranged before, and others report meanwhile: not all data are missing.
         """
         way_m = hypot(a.dx_m, a.dy_m)
+        if way_m > STILL_M_S * a.duration_s:
+            self.carried_s = inf
         if self.within.ended:
             self.before_s, self.begun_s = self.begun_s, a.time_s - a.duration_s
         self.within.move(way_m, a.duration_s, a.fraction, usual_m_s)
@@ -360,8 +365,10 @@ class Presence:
         """Return whether it walks unseen: it reported its motion up to ``reported_s`` alone.
 
         It does so from its last velocity on, with the heading that is asked for then. Who never
-        reported any motion does not.
+        reported any motion does not, unless its ranges contradict that.
         """
+        if self.carried_s < inf:
+            reported_s = self.carried_s
         since_s = max(self.diffused_s, reported_s)
         if not -inf < since_s < time_s:
             return False
@@ -372,6 +379,17 @@ class Presence:
             world_m_s = np.array([c * forward - s * left, s * forward + c * left])
             self.unseen = UnseenWalk(reported_s, world_m_s)
         self.diffused_s = since_s
+        return True
+
+    def contradict(self, time_s: float) -> bool:
+        """Note that ranges contradict its place; return whether it reports to stand.
+
+        It is carried then, or its inertial sensor fails: from now on it walks unseen, until it
+        reports motion.
+        """
+        if hypot(*self.velocity_m_s) > STILL_M_S:
+            return False
+        self.carried_s = min(self.carried_s, time_s)
         return True
 
     def walk_unseen(self, time_s: float) -> tuple[float, Floats, Floats] | None:

@@ -103,3 +103,33 @@ def test_a_gap_in_all_data_is_no_restart_and_the_reports_after_it_count() -> Non
     result = relpos.fuse(replace(run, measurements=tuple(kept)))
     afterwards = [e for e in result.estimates if e.time_s > 68.0]
     assert all(status is NodeStatus.OK for e in afterwards for status in e.pair_statuses())
+
+
+@pytest.mark.parametrize(("nodes", "since_s"), [(6, -1.0), (24, 30.0)])
+def test_somebody_who_reports_to_stand_and_is_carried_is_followed_by_his_ranges(
+    nodes: int, since_s: float
+) -> None:
+    run = relpos.simulate("mission-base", 1, nodes=nodes, seconds=80)
+    kept = []
+    for m in run.measurements:
+        if isinstance(m, Motion) and m.node == 3 and m.time_s > since_s:
+            # An inertial sensor that never worked, or a person on a stretcher.
+            if since_s < 0.0:
+                continue
+            m = replace(m, dx_m=0.0, dy_m=0.0, dtheta_rad=0.0)
+        kept.append(m)
+    result = relpos.fuse(replace(run, measurements=tuple(kept)))
+    true = {(t.time_s, t.node): np.array([t.x_m, t.y_m]) for t in run.truth}
+    square, over = [], []
+    for e in result.estimates:
+        if e.time_s < 45.0:
+            continue
+        at_s = float(round(e.time_s))
+        for pair, status in zip(e.pairs, e.pair_statuses(), strict=True):
+            if 3 in (pair.node, pair.peer):
+                distance_m = float(np.linalg.norm(true[at_s, pair.node] - true[at_s, pair.peer]))
+                off = (pair.distance_m - distance_m) / pair.sigma_distance_m
+                square.append(off**2)
+                over.append(status is NodeStatus.OK and abs(off) > 3.0)
+    assert np.mean(square) < 1.6
+    assert np.mean(over) < 0.015

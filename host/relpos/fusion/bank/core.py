@@ -232,8 +232,16 @@ class BankCore:
         i, k = every_pair(len(rows))
         return self.predicted_ranges(rows[i], rows[k], np.zeros(len(i)))
 
-    def end_instant(self, time_s: float) -> None:
-        """Resize, relocalise, resample where the weights are uneven, and perturb a few."""
+    @property
+    def faulty_row(self) -> int | None:
+        """Whose ranges of this instant have shown an odometry fault."""
+        return None if self._alarm is None else self._alarm[0]
+
+    def end_instant(self, time_s: float, *, turned: bool = True) -> None:
+        """Resize, relocalise, resample where the weights are uneven, and perturb a few.
+
+        A user with an odometry fault may have ``turned``.
+        """
         these, relocalisation = self.hypotheses, self.relocalisation
         known = self._sensors
         share = sensors.expect_outliers(known.outlier_counts, known.model.outlier)
@@ -249,7 +257,7 @@ class BankCore:
         if self._alarm is not None:
             self.counters["slips"] += 1
             row, ranges = self._alarm
-            relocalisation.relocalise(row, ranges, JUMP_M)
+            relocalisation.relocalise(row, ranges, JUMP_M, turned=turned)
             self._alarm = None
         elif these.count > self.adaptive.ceiling and not relocalisation.open:
             these.resample(these.weights(), self.adaptive.ceiling)

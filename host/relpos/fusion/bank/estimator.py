@@ -295,7 +295,14 @@ class Bank:
                 walk.correct(moved - place, spread, left)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
-        self.core.end_instant(time_s)
+        self._end_instant(time_s)
+
+    def _end_instant(self, time_s: float) -> None:
+        faulty, stands = self.core.faulty_row, False
+        for node, row in self._row.items():
+            if row == faulty:
+                stands = self._known[node].contradict(time_s)
+        self.core.end_instant(time_s, turned=not stands)
 
     def _repeats(self, pairs: Sequence[tuple[int, int]]) -> Repeats:
         """Return what the ranges of ``pairs`` repeat; those that are less certain count less."""

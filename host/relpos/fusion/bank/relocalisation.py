@@ -136,10 +136,13 @@ class Relocalisation:
         ranges: tuple[Indices, Indices, Floats],
         place_m: float,
         lost: tuple[bool, bool] | None = None,
+        *,
+        turned: bool = True,
     ) -> None:
         """Move a user to the ring of a range in most hypotheses, ``place_m`` off at most.
 
-        In all hypotheses, where its place or heading or both are ``lost``.
+        In all hypotheses, where its place or heading or both are ``lost``. Where it has not
+        ``turned``, the heading stays.
         """
         first, second, range_m = ranges
         these = self._hypotheses
@@ -153,7 +156,8 @@ class Relocalisation:
         at, lane = (a[:, None] for a in these.at(which))
         own, beside = POSE * row + np.arange(POSE), POSE * peer[:, None] + np.arange(2)
         x = these.arrays.x
-        made = perturb(x[at, own, lane], x[at, beside, lane], range_m[sight], place_m, these.rng)
+        old, peers_m = x[at, own, lane], x[at, beside, lane]
+        made = perturb(old, peers_m, range_m[sight], place_m, these.rng, turned=turned)
         x[at, own, lane] = made.poses
         # What was lost is no longer correlated with anything else.
         for kept, part in zip(made.kept.T, (np.array([0, 1]), np.array([2])), strict=True):

@@ -384,7 +384,7 @@ class LargeTeam:
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
         self._learn_sigma(node, peer, horizontal, inlier)
         news = 1.0 - outliers[:, 0]
-        self._inflate(both, np.tile(inlier, 2), np.tile(news, 2))
+        self._inflate(time_s, both, np.tile(inlier, 2), np.tile(news, 2))
 
     def _correct_unseen(
         self, pairs: Sequence[tuple[int, int]], time_s: float, place_m: Floats, prior: Floats
@@ -414,7 +414,7 @@ class LargeTeam:
         self.filter.model = model._replace(sigma_m=sigma_m)
         self._sigma_count = min(self._sigma_count + total, SIGMA_R_MEMORY)
 
-    def _inflate(self, rows: Indices, inlier: Floats, news: Floats) -> None:
+    def _inflate(self, time_s: float, rows: Indices, inlier: Floats, news: Floats) -> None:
         """Inflate nodes most of whose ranges are outliers: carried nodes, odometry faults.
 
         ``news`` is how probably each was expected to be none: walls are no news of a node.
@@ -429,6 +429,8 @@ class LargeTeam:
             self.filter.inflate(wrong, JUMP_M, TURNED_RAD)
             self._outlying[wrong] = 0.0
             self._own["jumps"] += int(wrong.size)
+            for row in wrong.tolist():
+                self._known[self._nodes[row]].contradict(time_s)
 
     # -- nodes that are not located ------------------------------------------------------------
 

@@ -165,18 +165,20 @@ class Perturbations:
 
 
 def perturb(
-    old: Floats, peers: Floats, range_m: Floats, place_m: float, rng: np.random.Generator
-) -> Perturbations:
+    old: Floats, peers: Floats, range_m: Floats, place_m: float, rng: np.random.Generator,
+    *, turned: bool = True,
+) -> Perturbations:  # fmt: skip
     """Perturb each of a faulty node's poses ``old`` (M, 3).
 
     ``peers`` (M, 2) is where each hypothesis has the peer that ranged it, ``range_m`` (M,) how
     far away. Of six poses, one keeps the place, one the heading. A new place is up to some
     ``place_m`` away from the old one and on the peer's ring; new headings are drawn evenly round
-    the circle, so that each has to be right only to its share of it.
+    the circle, so that each has to be right only to its share of it. A node that has not
+    ``turned`` keeps its heading.
     """
     count = len(old)
     kind = rng.permutation(count) % 6
-    keeps = np.stack([kind == 0, kind == 1], axis=1)
+    keeps = np.stack([kind == 0, (kind == 1) | (not turned)], axis=1)
     poses = old.copy()
     off = old[:, :2] + place_m * rng.standard_normal((count, 2)) - peers
     distance = np.maximum(np.hypot(off[:, 0], off[:, 1]), 1e-6)
