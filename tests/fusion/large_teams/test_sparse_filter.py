@@ -10,7 +10,7 @@ import pytest
 
 from crowd import Crowd, CrowdSettings, side_of, simulate_crowd
 from reference import neighbourhood as dense
-from relpos.fusion.large_teams.kernels import RangeModel
+from relpos.fusion.large_teams.kernels import RangeModel, displacements
 from relpos.fusion.large_teams.sparse_filter import (
     JITTER_CONSTANT,
     JITTER_M2,
@@ -114,6 +114,23 @@ def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
     got = made.pairs(node, peer)
     expected = dense.spread(pose, covariance, node, peer)
     assert np.allclose(got, expected, atol=1e-9)
+
+
+def test_a_displacement_errs_along_its_way_more_than_across_it_and_takes_no_time_at_rest() -> None:
+    rng = np.random.default_rng(5)
+    moves, variances = rng.normal(size=(20, 4)), rng.uniform(size=(20, 3))
+    moves[:2, :3] = 0.0
+    moves[1, 2] = 0.1
+    moved = displacements(moves, variances)
+    forward, left = moves[:, :2].T
+    way = np.maximum(np.hypot(forward, left), 1e-6)
+    along = variances[:, 0]
+    expected = np.sqrt(along * (forward**2 + 0.1 * left**2)) / way
+    assert moved[:, 3] == pytest.approx(expected, rel=1e-12)
+    assert moved[:, 4] == pytest.approx(np.sqrt(along * (left**2 + 0.1 * forward**2)) / way)
+    assert moved[:, 5] == pytest.approx(np.sqrt(variances[:, 1] + variances[:, 2]), rel=1e-12)
+    assert moved[:, 6].tolist() == [0.0, *moves[1:, 3]]
+    assert (moved[:, :3] == moves[:, :3]).all()
 
 
 def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> None:

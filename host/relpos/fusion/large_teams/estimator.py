@@ -32,12 +32,12 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
-from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
+from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges, displacements
 from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, prior_information
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
-from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
+from relpos.fusion.models.motion_variances import base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
     CommonIndex,
@@ -66,9 +66,6 @@ OUTLIERS, OUTLIER_M = 0.01, 3.0
 """A large team's fraction of outliers is not learned: 0.05 and 5 m cost a crowd 0.002 m of
 0.12."""
 
-
-ACROSS = 0.1
-"""Variance of a displacement across its direction relative to that along it."""
 
 ONE_STRIP = 50
 """Up to so many nodes are in one strip, where nothing is assumed of far ones, at no more time.
@@ -281,19 +278,9 @@ class LargeTeam:
             else:
                 move[:2] *= self._known[a.node].undiffused(a.time_s, a.duration_s)
         reported = np.array([reported_sigmas(a) for a in steps])
-        dx, dy, turn, duration_s = moves.T
-        variance = base_variances(moves, reported) * self._components.factor[rows]
-        self._components.add_turns(rows, turn)
-        # Along the path, and a tenth of that across, both in the frame of the body.
-        square = np.maximum(dx * dx + dy * dy, 1e-12)
-        along = variance[:, ALONG]
-        sigma_x = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / square)
-        sigma_y = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / square)
-        sigma_turn = np.sqrt(variance[:, TURN] + variance[:, WHITE])
-        # Who reports nothing at all stands, and the heading with it.
-        moving_s = np.where((square > 1e-12) | (turn != 0.0), duration_s, 0.0)
-        moved = np.column_stack([moves[:, :3], sigma_x, sigma_y, sigma_turn, moving_s])
-        self.filter.predict(rows, moved)
+        variances = base_variances(moves, reported) * self._components.factor[rows]
+        self._components.add_turns(rows, moves[:, 2])
+        self.filter.predict(rows, displacements(moves, variances))
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to."""
@@ -330,23 +317,21 @@ class LargeTeam:
 
     def _collect(self, time_s: float, ranges: Sequence[Range]) -> None:
         """Put ranges aside, as excesses over the distances that are estimated at their instant."""
-        rows = np.array([(self._row[r.node], self._row[r.peer]) for r in ranges])
-        off = self.filter.antennas_m(rows[:, 1]) - self.filter.antennas_m(rows[:, 0])
-        distance = np.hypot(off[:, 0], off[:, 1])
-        sight = (off / np.maximum(distance, NEAREST_M)[:, None]).tolist()
-        headings = self.filter.pose[rows, 2].tolist()
-        for k, r in enumerate(ranges):
+        rows = np.array([self._row[n] for r in ranges for n in (r.node, r.peer)])
+        places_m = self.filter.antennas_m(rows).reshape(-1, 4).tolist()
+        headings = self.filter.pose[rows, 2].reshape(-1, 2).tolist()
+        for r, (x, y, peer_x, peer_y), facing in zip(ranges, places_m, headings, strict=True):
             ends = self._known[r.node], self._known[r.peer]
             height_m = ends[1].vertical.z_m - ends[0].vertical.z_m
             variance_m2 = sum(known.vertical.sigma_z_m**2 for known in ends)
             horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
-            apart_m = float(distance[k])
-            velocities = [known.velocity_at(time_s) for known in ends]
-            slopes = slopes_of((sight[k][0], sight[k][1]), apart_m, headings[k], velocities)
-            excess_m = horizontal_m - apart_m
-            self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
+            apart_m = math.hypot(peer_x - x, peer_y - y)
+            near_m = max(apart_m, NEAREST_M)
+            sight = (peer_x - x) / near_m, (peer_y - y) / near_m
+            slopes = slopes_of(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
+            self._collected.append(_Collected(r, horizontal_m - apart_m, slopes, lifted_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
         self._collected_s = min(self._collected_s, time_s)
         self._ranges_used += len(ranges)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, Blocks, StripLayout
 from relpos.fusion.models.motion import SCALE_WALK
+from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE
 from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
 
 Floats = npt.NDArray[np.float64]
@@ -24,6 +25,31 @@ LEVERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1))
 
 ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (4, 4))
 """States (x, y, heading, drift, scale) between which moving adds covariance."""
+
+
+ACROSS = 0.1
+"""Variance of a displacement across its direction relative to that along it."""
+
+
+@compiled
+def displacements(moves: Floats, variances: Floats) -> Floats:
+    """Give displacements as ``move`` takes them (E, 7), of forward, left, turn, duration (E, 4).
+
+    ``variances`` (E, 3) are those of ``motion_variances``.
+    """
+    moved = np.empty((len(moves), 7))
+    for e in range(len(moves)):
+        dx, dy, turn, duration_s = moves[e, 0], moves[e, 1], moves[e, 2], moves[e, 3]
+        # Along the path, and a tenth of that across, both in the frame of the body.
+        square = max(dx * dx + dy * dy, 1e-12)
+        along = variances[e, ALONG] / square
+        moved[e, :3] = moves[e, :3]
+        moved[e, 3] = math.sqrt(along * (dx * dx + ACROSS * dy * dy))
+        moved[e, 4] = math.sqrt(along * (dy * dy + ACROSS * dx * dx))
+        moved[e, 5] = math.sqrt(variances[e, TURN] + variances[e, WHITE])
+        # Who reports nothing at all stands, and the heading with it.
+        moved[e, 6] = duration_s if square > 1e-12 or turn != 0.0 else 0.0
+    return moved
 
 
 @compiled
