@@ -18,6 +18,7 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.bank import mixture
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_models import PAIR_BIASES
@@ -538,7 +539,8 @@ class Bank:
         these, rows = self.core.hypotheses, self._row
         lateness = these.common_entry(CommonIndex.LATENESS)
         sigma_s = math.sqrt(max(float(covariance[lateness, lateness]), 0.0))
-        offset_s, sigmas_s = these.clock_offsets(mean, covariance)
+        clocks = these.clock_entries()
+        offset_s, sigmas_s = mean[clocks], mixture.deviations_within(covariance, clocks)
         usual_s = median(offset_s.tolist()) if rows else 0.0
         offsets = {n: (offset_s[row] - usual_s, sigmas_s[row]) for n, row in rows.items()}
         late_s, steps = self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)

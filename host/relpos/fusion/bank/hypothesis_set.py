@@ -48,7 +48,7 @@ class HypothesisSet:
     Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 4 + pairs
     entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
     common (:class:`~relpos.fusion.models.ranging.CommonIndex`), each user's clock offset, and the
-    range bias of each pair when it is first ranged.
+    range bias of each pair when it is first ranged (in large teams the antenna delay of each user).
     """
 
     def __init__(
@@ -82,6 +82,8 @@ class HypothesisSet:
         """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its range bias in the state."""
+        self.delays: dict[int, int] = {}
+        """Row -> entry of its antenna delay, by which each of its ranges is too long (m)."""
         self._allow_common(np.arange(count))
         self.common: Floats = np.zeros((RIGID, RIGID))
         """Covariance of the rigid motion of the whole team that has been taken out."""
@@ -290,6 +292,7 @@ class HypothesisSet:
         p[:, clock, clock] = models.has_biases * CLOCK_SD_S**2
         self.store(x, p)
         self.biases = {pair: place + PER_NODE + 1 for pair, place in self.biases.items()}
+        self.delays = {user: place + PER_NODE + 1 for user, place in self.delays.items()}
         self.components.add_node()
         drawn = self.rng.standard_normal((count, COMPONENTS))
         self._normals = np.concatenate([self._normals[:, :-1], drawn, self._normals[:, -1:]], 1)
@@ -346,35 +349,9 @@ class HypothesisSet:
         """Return the entry of the state that holds a user's clock offset."""
         return PER_NODE * self.nodes + COMMON + row
 
-    def clock_offsets(self, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-        """Return the users' clock offsets (N,) by the moments, and their deviations (s).
-
-        These are relative to the mean of all: ranges say how clocks differ, and no more.
-        """
-        entries = PER_NODE * self.nodes + COMMON + np.arange(self.nodes)
-        own = np.eye(self.nodes) - 1.0 / max(self.nodes, 1)
-        spread = (own @ covariance[np.ix_(entries, entries)] @ own).diagonal()
-        return mean[entries], np.sqrt(np.maximum(spread, 0.0))
-
-    def pairs_learned(self) -> tuple[bool, dict[tuple[int, int], tuple[float, float]]]:
-        """Return each pair of rows' own constant and its variance, and whether it is a height.
-
-        Squares of differences of height (m^2, m^4) where most hypotheses have these, else biases.
-        """
-        if not self.biases:
-            return False, {}
-        weight = self.weights()
-        has_heights = self.models.has(RangeErrors.HEIGHT)
-        heights = bool(weight @ has_heights > 0.5)
-        weight = weight * (has_heights == heights)
-        weight /= weight.sum()
-        entries = np.array(list(self.biases.values()), dtype=np.int64)
-        own = self.arrays.p[:, storage.triangle_place(entries, entries)]
-        means = storage.of_each(self.arrays.x[:, entries], self.count)
-        mean = weight @ means
-        variance = weight @ (storage.of_each(own, self.count) + (means - mean) ** 2)
-        learned = zip(mean.tolist(), variance.tolist(), strict=True)
-        return heights, dict(zip(self.biases, learned, strict=True))
+    def clock_entries(self) -> Indices:
+        """Return the entries of all users' clock offsets (N,)."""
+        return PER_NODE * self.nodes + COMMON + np.arange(self.nodes)
 
     def _allow_common(self, which: Indices) -> None:
         """Let those of ``which`` (M,) that have biases model what ranges have in common."""
@@ -383,7 +360,9 @@ class HypothesisSet:
             self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M,
             self.common_entry(CommonIndex.LATENESS): LATENESS_SD_S,
             self.common_entry(CommonIndex.GROWTH): GROWTH_SD_M,
-        } | {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
+        }
+        priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
+        priors |= dict.fromkeys(self.delays.values(), self.settings.pair_bias_m)
         block, lane = self.at(which)
         p, has = self.arrays.p, self.models.has_biases[which]
         for entry, sigma in priors.items():
@@ -458,38 +437,48 @@ class HypothesisSet:
         self.arrays.x[:, self._place(row, StateIndex.SCALE)] = scales
 
     def bias_entries(self, first: Indices, second: Indices) -> Indices:
-        """Entries of the state that hold the biases of ranges; those of new pairs are added.
+        """Entries of the state (R, 3) that hold the biases of ranges; new ones are added.
 
         A pair's bias is the common one plus its own part, so a new pair begins with what is known
-        of the common one. Where there are too many pairs, only the common one is modelled.
+        of the common one. Where there are too many pairs, it is the common one and both users'
+        antenna delays; -1 where there is none of these.
         """
+        entries = np.full((len(first), 3), -1, dtype=np.int64)
         if not self.models.has_biases.any():
-            return np.full(len(first), -1, dtype=np.int64)
+            return entries
         common = self.common_entry(CommonIndex.BIAS)
-        entries = np.full(len(first), common, dtype=np.int64)
         for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
             pair = (a, b) if a < b else (b, a)
-            entry = self.biases.get(pair)
-            if entry is None and self.nodes <= PAIR_BIASES:
-                entry = self._add_bias(pair)
-            if entry is not None:
-                entries[r] = entry
+            if pair not in self.biases and self.nodes <= PAIR_BIASES:
+                inherits = 1.0 - self.arrays.has_heights
+                self.biases[pair] = self._add_bias(inherits, self._own_variance())
+            if pair in self.biases:
+                entries[r, 0] = self.biases[pair]
+                continue
+            for user in (a, b):
+                if user not in self.delays:
+                    variance = self.models.has_biases * self.settings.pair_bias_m**2
+                    none = np.zeros_like(self.arrays.has_heights)
+                    self.delays[user] = self._add_bias(none, variance)
+            entries[r] = common, self.delays[a], self.delays[b]
         return entries
 
-    def _add_bias(self, pair: tuple[int, int]) -> int:
+    def _add_bias(self, inherits: Floats, variance: Floats) -> int:
+        """Add an entry for a bias, and return it: the common one where it ``inherits``, and more.
+
+        ``inherits`` (B, LANES) is 1 or 0; ``variance`` (K,) is that of its own part, mean 0.
+        """
         x0, p0 = self.arrays.x, self.arrays.p
         size, old = int(x0.shape[1]), p0.shape[1]
         common = self.common_entry(CommonIndex.BIAS)
         x = lanes.empty_lines(len(x0), size + 1)
         p = lanes.empty_lines(len(x0), old + size + 1)
-        inherits = 1.0 - self.arrays.has_heights
         x[:, :size], x[:, size] = x0, inherits * x0[:, common]
         p[:, :old] = p0
         shared = p0[:, storage.triangle_place(common, np.arange(size))]
         p[:, old:-1] = inherits[:, None] * shared
-        p[:, -1] = inherits * shared[:, common] + storage.lay_out(self._own_variance())
+        p[:, -1] = inherits * shared[:, common] + storage.lay_out(variance)
         self.arrays = self.arrays._replace(x=x, p=p)
-        self.biases[pair] = size
         return size
 
     # -- resampling ----------------------------------------------------------------------------

@@ -12,8 +12,8 @@ stays finite where two users meet.
 What many ranges have in common enters to first order. With the direction u from the first to the
 second, the velocities v and the headings n (a body shadows who is behind it)
 
-    E rho = m + bias + shadow (max(-u n_i, 0) + max(u n_j, 0)) - lateness u (v_j - v_i)
-              - (clock_i - clock_j) u v_j + growth log(m / 5 m)
+    E rho = m + bias + delay_i + delay_j + shadow (max(-u n_i, 0) + max(u n_j, 0))
+              - lateness u (v_j - v_i) - (clock_i - clock_j) u v_j + growth log(m / 5 m)
 
 as the first, whose clock dates the range, sees the second where it was when that clock was right.
 Reference implementation: :mod:`reference.joint`.
@@ -80,7 +80,8 @@ class Ranges(NamedTuple):
     kept: Floats
     """What is left of a passing bias since the pair's last range."""
     bias: Indices
-    """Entry of the state that holds the range's bias, or -1."""
+    """(R, 3): entries of the state that hold the range's bias and both users' antenna delays; -1
+    where there is none."""
     velocity_m_s: Floats
     """(R, 4): of the first, forward and left, and of the second; no motion is 0."""
     outliers: Floats
@@ -402,7 +403,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
     x, p, log_weight = hypotheses.x, hypotheses.p, hypotheses.log_weight
     blocks, nodes = x.shape[0], hypotheses.sensitivity.shape[1]
     g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])
-    slope, entry = lanes.working_lines(7), np.empty(7, dtype=np.int64)
+    slope, entry = lanes.working_lines(8), np.empty(8, dtype=np.int64)
     own = PER_NODE * nodes + COMMON + nodes
     for b in range(blocks):
         block = block_of(x, p, b, nodes)
@@ -418,13 +419,14 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             first, second, dz = ranges.first[r], ranges.second[r], ranges.dz_m[r]
             i, j = POSE * first, POSE * second
             # What is common to all comes before a pair's own entry.
-            own_entry = ranges.bias[r] >= own
+            bias = ranges.bias[r, 0]
+            own_entry = bias >= own
             if passes and own_entry:
-                _pass_bias(block, ranges.bias[r], common, ranges.kept[r], passing)
+                _pass_bias(block, bias, common, ranges.kept[r], passing)
             heights_here = heights and own_entry
             dz2, lifted = fill(dz * dz), fill(0.0)
             if heights_here:
-                lifted = has_heights * greater(load(x, block.at_x + ranges.bias[r]), lifted)
+                lifted = has_heights * greater(load(x, block.at_x + bias), lifted)
                 dz2 = dz2 + lifted
             if model.lever_m.shape[0] > 0:
                 levers = (model.lever_m[first], model.lever_m[second])
@@ -438,10 +440,10 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 vague = ranges.dz_variance_m2[r]
                 v = v + (dz * dz - 0.5 * vague) * vague / (m * m)
             innovation = ranges.range_m[r] - m
-            if biased and ranges.bias[r] >= 0:
+            if biased and bias >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
                 users, sight = (nodes, first, second), (gx, gy, m, seen)
-                entry[0] = ranges.bias[r]
+                entry[0] = bias
                 _common_terms(block, users, ranges.velocity_m_s[r], sight, slope, entry)
                 terms = 6
                 if heights_here:
@@ -452,6 +454,10 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                     store(slope, 0, chord + (1.0 - has_heights) * seen)
                     # What the mean has of it is in m.
                     innovation = innovation + chord * lifted
+                if ranges.bias[r, 1] >= 0:
+                    entry[6], entry[7], terms = ranges.bias[r, 1], ranges.bias[r, 2], 8
+                    store(slope, 6, seen)
+                    store(slope, 7, seen)
                 length, added = _add_terms(block, slope, entry, terms, g)
                 innovation = innovation - length
                 v = v + added

@@ -16,8 +16,10 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.bank import mixture, storage
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
+from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mirrored import VAGUE_RAD
 from relpos.fusion.bank.storage import PER_NODE, StateIndex, every_pair
 from relpos.fusion.clocks import Clocks
@@ -184,7 +186,7 @@ class Report:
                 Parameter(time_s, node, None, "step_scale", grow, grow * sigma_scale),
                 Parameter(time_s, node, None, "heading_drift_rad_s", means[drift], sigma_drift),
             ]
-        parameters += [*self._pair_parameters(), *self._common_parameters()]
+        parameters += self._pair_parameters() + self._common_parameters() + self._delays()
         if self.detection.known:
             # One curve for the team; every node has it.
             curve = self.detection.range_m, self.detection.range_sigma_m
@@ -197,7 +199,7 @@ class Report:
     def _pair_parameters(self) -> list[Parameter]:
         """Return the pairs' range biases, or differences of height where hypotheses have these."""
         named, parameters = {row: node for node, row in self.row.items()}, []
-        heights, learned = self.core.hypotheses.pairs_learned()
+        heights, learned = _pairs_learned(self.core.hypotheses)
         for (a, b), (value, variance) in sorted(learned.items()):
             name, sigma = "range_bias_m", math.sqrt(max(variance, 0.0))
             if heights:
@@ -226,7 +228,8 @@ class Report:
         shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
         growth = learned(CommonIndex.GROWTH)
         late = lateness + clocks.lateness_s, sigma
-        offsets, sigmas = these.clock_offsets(self.mean, self.covariance)
+        entries = these.clock_entries()
+        offsets, sigmas = self.mean[entries], mixture.deviations_within(self.covariance, entries)
         offset = {n: float(offsets[self.row[n]]) + clocks.offset_s.get(n, 0.0) for n in nodes}
         # Ranges say how clocks differ, and most are right.
         usual = median(offset.values())
@@ -242,6 +245,18 @@ class Report:
                 Parameter(self.time_s, node, None, "clock_offset_s", *own),
             ]
         return parameters
+
+    def _delays(self) -> list[Parameter]:
+        """Return antenna delays (m), relative to the mean of all: what they share is a bias."""
+        delays = self.core.hypotheses.delays
+        entries = np.array(list(delays.values()), dtype=np.int64)
+        named = {row: node for node, row in self.row.items()}
+        sigmas = mixture.deviations_within(self.covariance, entries).tolist()
+        values = self.mean[entries] - self.mean[entries].mean() if delays else entries
+        return [
+            Parameter(self.time_s, named[row], None, "antenna_delay_m", value, sigma)
+            for row, value, sigma in sorted(zip(delays, values.tolist(), sigmas, strict=True))
+        ]
 
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)
@@ -291,6 +306,29 @@ class Report:
         """List the modes of the team."""
         spread = team.place_covariances()
         return alternatives_of(self.time_s, team.nodes, team.weights, team.poses, spread)
+
+
+def _pairs_learned(
+    these: HypothesisSet,
+) -> tuple[bool, dict[tuple[int, int], tuple[float, float]]]:
+    """Return each pair of rows' own constant and its variance, and whether it is a height.
+
+    Squares of differences of height (m^2, m^4) where most hypotheses have these, else biases.
+    """
+    if not these.biases:
+        return False, {}
+    weight = these.weights()
+    has_heights = these.models.has(RangeErrors.HEIGHT)
+    heights = bool(weight @ has_heights > 0.5)
+    weight = weight * (has_heights == heights)
+    weight /= weight.sum()
+    entries = np.array(list(these.biases.values()), dtype=np.int64)
+    own = these.arrays.p[:, storage.triangle_place(entries, entries)]
+    means = storage.of_each(these.arrays.x[:, entries], these.count)
+    mean = weight @ means
+    variance = weight @ (storage.of_each(own, these.count) + (means - mean) ** 2)
+    learned = zip(mean.tolist(), variance.tolist(), strict=True)
+    return heights, dict(zip(these.biases, learned, strict=True))
 
 
 def _at_mode(node: NodeEstimate, team: PoseMixture) -> NodeEstimate:
