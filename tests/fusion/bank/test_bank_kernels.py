@@ -92,7 +92,8 @@ def updated(
 ) -> Floats:  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.zeros(1), np.array([-1]), np.zeros((1, 4)), np.array([[outlier[0], *again]]),
+        np.ones(1), np.zeros(1), np.full((1, 3), -1), np.zeros((1, 4)),
+        np.array([[outlier[0], *again]]),
     )  # fmt: skip
     levers_m = np.zeros((0, 2)) if lever_m is None else lever_m
     model = RangeModel(np.array([*outlier[:2], 1.0, 9.0]), levers_m)
@@ -252,7 +253,7 @@ def test_two_ranges_at_once_are_one_after_the_other() -> None:
         number = len(measured[rows])
         ranges = Ranges(
             ends[0][rows], ends[1][rows], measured[rows], np.zeros(number), np.zeros(number),
-            np.ones(number), np.zeros(number), np.full(number, -1), np.zeros((number, 4)),
+            np.ones(number), np.zeros(number), np.full((number, 3), -1), np.zeros((number, 4)),
             np.tile([OUTLIER[0], 0.0, 0.0], (number, 1)),
         )  # fmt: skip
         model = RangeModel(np.array([*OUTLIER[:2], 1.0, 9.0]), np.zeros((0, 2)))
@@ -467,7 +468,7 @@ def test_variance_components_are_learned_from_innovations_and_their_uncertainty_
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             ranges = Ranges(
                 np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
-                np.ones(1), np.zeros(1), np.array([-1]), np.zeros((1, 4)), np.zeros((1, 3)),
+                np.ones(1), np.zeros(1), np.full((1, 3), -1), np.zeros((1, 4)), np.zeros((1, 3)),
             )  # fmt: skip
             components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
         errors.append(known.mean - truth)

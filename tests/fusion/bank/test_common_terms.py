@@ -40,7 +40,7 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
         core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
     these = core.hypotheses
     pair = np.array([0]), np.array([2])
-    entry = int(these.bias_entries(*pair)[0])
+    entry = int(these.bias_entries(*pair)[0, 0])
     x, p = these.dense()
     common = PER_NODE * NODES
     x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
@@ -78,6 +78,49 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
         )
         assert after[0][k] == pytest.approx(expected[0], rel=1e-3, abs=1e-3)
         assert after[1][k] == pytest.approx(expected[1], rel=1e-3, abs=1e-3)
+
+
+def test_in_a_team_of_more_than_six_both_antenna_delays_are_in_a_range() -> None:
+    nodes, settings = 7, BankSettings(hypotheses=8, wrong_starts=0.0, biased=1.0, constants=0.0)
+    core = BankCore(settings, 3)
+    for n in range(nodes):
+        core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
+    these = core.hypotheses
+    common, *delays = these.bias_entries(np.array([4]), np.array([2]))[0].tolist()
+    x, p = these.dense()
+    assert p[:, delays, delays] == pytest.approx(settings.pair_bias_m**2)
+    x[:, delays] = 0.2, -0.3
+    these.store(x, p)
+    slope = reference.common_terms(x[0], p[0], nodes, 4, 2, np.zeros((2, 2)))
+    slope[delays] = slope[common]
+    sigma2 = these.arrays.range_variance.ravel()[:8].copy()
+    core.update(np.array([4]), np.array([2]), np.array([48.0]), np.zeros(1))
+    after, share = these.dense(), core._sensors.model.outlier
+    for k in range(8):
+        outlier = float(share[0]), float(share[1]), OUTLIERS_SHORT
+        expected = reference.update(x[k], p[k], 4, 2, 48.0, 0.0, sigma2[k], outlier, nodes, slope)
+        assert after[0][k] == pytest.approx(expected[0], rel=1e-3, abs=1e-3)
+        assert after[1][k] == pytest.approx(expected[1], rel=1e-3, abs=1e-3)
+
+
+def test_a_tag_whose_ranges_are_all_too_long_is_found_and_told() -> None:
+    nodes = 8
+    run = relpos.simulate("mission-base", 1, nodes=nodes, seconds=80)
+    ranges = (
+        dataclasses.replace(m, range_m=m.range_m + 0.3)
+        if isinstance(m, Range) and 3 in (m.node, m.peer) and m.range_m > 0.0
+        else m
+        for m in run.measurements
+    )
+    late = dataclasses.replace(run, measurements=tuple(ranges))
+    result = relpos.fuse(late)
+    score = relpos.evaluate(result, run, bound=False).metrics
+    assert score.relative_distance_rmse_m < 0.16
+    assert score.nees_distance < 1.2
+    assert score.ok_over_3_sigma < 0.01
+    told = {p.node: p for p in result.estimates[-1].parameters if p.name == "antenna_delay_m"}
+    assert told[3].value == pytest.approx(0.3 * (1.0 - 1.0 / nodes), abs=0.1)
+    assert all(abs(told[n].value) < 0.1 for n in told if n != 3)
 
 
 def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:

@@ -53,7 +53,8 @@ def updated(
     )  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([1]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.zeros(1), np.array([-1]), np.zeros((1, 4)), np.array([[1e-9, 0.0, 0.0]]),
+        np.ones(1), np.zeros(1), np.full((1, 3), -1), np.zeros((1, 4)),
+        np.array([[1e-9, 0.0, 0.0]]),
     )  # fmt: skip
     model = RangeModel(np.array([1e-9, 9.0, 1.0, 9.0]), levers_m)
     range_update.update(hypotheses, ranges, model, lanes.empty_lines(1, range_update.STATS, 1))
