@@ -174,6 +174,7 @@ class Parameter:
     """One learned constant; ``peer`` is given where it belongs to a pair.
 
     Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``, ``range_bias_m``,
+    ``antenna_delay_m`` (by how much a tag's ranges are longer than most others'),
     ``height_difference_m`` (of a pair, where no heights are reported), ``detection_range_m``,
     ``body_shadow_m`` (what a body in between adds to a range), ``range_growth_m`` (by how much
     ranges grow for each factor e of the distance, about 5 m), ``range_scale`` (1, and by how much

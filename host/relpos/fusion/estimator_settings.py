@@ -32,7 +32,9 @@ class BankSettings:
     constants: float = setting(0.5, "share of hypotheses with scale and drift", 0.0, 1.0)
     steady: float = setting(0.4, "share of hypotheses with steady headings", 0.0, 1.0)
     bias_m: float = setting(0.3, "prior standard deviation of the range bias", 0.0, 10.0)
-    pair_bias_m: float = setting(0.1, "prior standard deviation of a pair's part", 0.0, 10.0)
+    pair_bias_m: float = setting(
+        0.1, "prior standard deviation of a pair's part, or of a tag's delay", 0.0, 10.0
+    )
     biased: float = setting(0.5, "share of hypotheses with range biases", 0.0, 1.0)
     spread: float = setting(0.5, "spread of the hypotheses' levels of noise", 0.0, 3.0)
     max_lag_s: float = setting(2.5, "how long a silent node is waited for", 0.0, 60.0)

@@ -52,6 +52,7 @@ _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
     "range_growth_m": ("growth of ranges (m)", 1.0),
     "range_lateness_s": ("ranges dated late (s)", 1.0),
     "clock_offset_s": ("clock ahead (s)", 1.0),
+    "antenna_delay_m": ("antenna delay (m)", 1.0),
 }
 
 

@@ -364,6 +364,7 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
     "range_scale": ("scale of ranges", "", 1.0, 3),
     "range_lateness_s": ("ranges dated late", "s", 1.0, 2),
     "clock_offset_s": ("clock ahead", "s", 1.0, 2),
+    "antenna_delay_m": ("antenna delay", "m", 1.0, 2),
 }
 
 

@@ -16,7 +16,7 @@ Indices = npt.NDArray[np.int64]
 
 PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
-Of more, the common one is modelled."""
+Of more, each user has its antenna's delay."""
 
 SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.05, 0.1, 0.07
 """Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
