@@ -159,6 +159,13 @@ def test_zero_self_and_repeated_ranges_are_dropped_and_counted() -> None:
     }  # fmt: skip
 
 
+def test_a_report_that_stands_twice_moves_its_node_once() -> None:
+    timeline = Timeline(nodes=[1])
+    reports = [Motion(float(k), 1, 1.0, 0.0, 0.0) for k in (1, 2, 2, 3)]
+    assert end_of(run(timeline, reports), 1) == pytest.approx((3.0, 0.0, 0.0))
+    assert timeline.counters == {"motions_duplicate": 1}
+
+
 def test_a_number_that_is_none_is_an_error() -> None:
     with pytest.raises(DataError, match="finite"):
         Timeline().push(Motion(1.0, 1, math.nan, 0.0, 0.0))

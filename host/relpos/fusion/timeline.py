@@ -135,11 +135,11 @@ class _Track:
     """Reports that wait, from the node's reached time on."""
     left: tuple[Displacement, float] | None = None
     """What is left of the first one, and its share of it; None where that is all."""
+    latest: Motion | None = None
+    """The report that came last."""
 
     def copy(self) -> _Track:
-        return _Track(
-            self.reported_s, self.reached_s, self.has_reported, self.chords.copy(), self.left
-        )
+        return replace(self, chords=self.chords.copy())
 
 
 def refusal(measurement: Measurement) -> str | None:
@@ -329,6 +329,9 @@ class Timeline:
         for entry in arrived[:count]:
             time_s, _, measurement = entry
             if isinstance(measurement, Motion):
+                if measurement == self._tracks[measurement.node].latest:
+                    self.counters["motions_duplicate"] += 1
+                    continue
                 self._take_motion(measurement)
             elif time_s <= self.frontier_s:
                 if self.keep_late:
@@ -347,6 +350,7 @@ class Timeline:
 
     def _take_motion(self, motion: Motion) -> None:
         track = self._tracks[motion.node]
+        track.latest = motion
         chords = track.chords
         begin_s = chords[-1].time_s if chords else track.reached_s
         placed = True
