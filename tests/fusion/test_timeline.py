@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -299,8 +300,9 @@ def test_the_first_of_a_nodes_motions_may_be_overtaken_too() -> None:
 
 def test_a_second_motion_of_an_instant_counts_whole_and_as_late() -> None:
     timeline = Timeline((1,), reorder_s=0.0, keep_late=True)
-    steps = run(timeline, [moved(1.0, 1), moved(1.0, 1), moved(2.0, 1)])
-    assert end_of(steps, 1) == (3.0, 0.0, 0.0)
+    second = replace(moved(1.0, 1), dx_m=2.0)
+    steps = run(timeline, [moved(1.0, 1), second, moved(2.0, 1)])
+    assert end_of(steps, 1) == (4.0, 0.0, 0.0)
     assert [s.time_s for s in steps if isinstance(s, Epoch)] == [1.0, 2.0]
     assert timeline.counters == {"motions_late": 1}
     assert [(late.since_s, late.time_s) for late in timeline.late] == [(-math.inf, 1.0)]
