@@ -249,11 +249,12 @@ def _share_inlier(
 
 @inner
 def _common_terms(
-    block: Block, users: tuple[int, int, int], velocity: Floats,
+    block: Block, users: tuple[int, int, int], velocity: Floats, bias: Indices,
     sight: tuple[Lanes, Lanes, Lanes, Lanes], slope: Floats, entry: Indices,
-) -> None:  # fmt: skip
-    """Write the entries of what ranges have in common, and a range's slopes in them (6 lines).
+) -> int:  # fmt: skip
+    """Write entries of the state that add to a range, and its slopes in them; return how many.
 
+    These are its ``bias``, what ranges have in common, and the antenna delays where there are any.
     ``users`` are N and the two rows, ``velocity`` (4,) theirs as in :class:`Ranges`; ``sight`` is
     the direction gx, gy, the distance, and whether they are apart: no range is negative, so that
     between two who stand together noise alone looks like a bias, and nothing is added there.
@@ -280,6 +281,13 @@ def _common_terms(
     entry[5] = common + CommonIndex.GROWTH
     far = greater(distance, fill(GROWTH_LEAST_M)) * (1.0 / GROWTH_USUAL_M)
     store(slope, 5, seen * lanes.log(far))
+    entry[0] = bias[0]
+    if bias[1] < 0:
+        return 6
+    for delay in (1, 2):
+        entry[5 + delay] = bias[delay]
+        store(slope, 5 + delay, seen)
+    return 8
 
 
 @inner
@@ -443,9 +451,8 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             if biased and bias >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
                 users, sight = (nodes, first, second), (gx, gy, m, seen)
-                entry[0] = bias
-                _common_terms(block, users, ranges.velocity_m_s[r], sight, slope, entry)
-                terms = 6
+                velocity = ranges.velocity_m_s[r]
+                terms = _common_terms(block, users, velocity, ranges.bias[r], sight, slope, entry)
                 if heights_here:
                     # m^2 is linear in the square of the height: its slope is that of the chord.
                     chord = has_heights / (m + greater(fill(ranges.range_m[r]), fill(0.0)))
@@ -454,10 +461,6 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                     store(slope, 0, chord + (1.0 - has_heights) * seen)
                     # What the mean has of it is in m.
                     innovation = innovation + chord * lifted
-                if ranges.bias[r, 1] >= 0:
-                    entry[6], entry[7], terms = ranges.bias[r, 1], ranges.bias[r, 2], 8
-                    store(slope, 6, seen)
-                    store(slope, 7, seen)
                 length, added = _add_terms(block, slope, entry, terms, g)
                 innovation = innovation - length
                 v = v + added
