@@ -143,7 +143,10 @@ class LargeTeam:
         self.vertical = VerticalFilter(posts=posts_of(self.mountings))
         model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M)
         self.filter = NeighbourhoodFilter(
-            math.inf, model, terms_information=prior_information(self.settings.bias_m)
+            math.inf,
+            model,
+            terms_information=prior_information(self.settings.bias_m),
+            delay_sd_m=self.settings.pair_bias_m,
         )
         known: list[Prior] = []
         for p in by_node(self.priors):
@@ -230,6 +233,8 @@ class LargeTeam:
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not nodes:
             return
+        if len(self._nodes) + len(nodes) > ONE_STRIP:
+            self.filter.delay_sd_m = 0.0
         self.filter.add(poses, covariances, (self.settings.drift_rad_s, self.settings.scale))
         for node in nodes:
             self._row[node] = len(self._nodes)
@@ -345,13 +350,14 @@ class LargeTeam:
             [(c.measured.node, c.measured.peer) for c in self._collected],
         )
         node, peer = (np.array([self._row[n] for n in ends]) for ends in zip(*pairs, strict=True))
-        slopes = np.array([c.slopes for c in self._collected])
+        common = np.array([c.slopes for c in self._collected])
         excess = np.array([c.excess_m for c in self._collected])
         lifted = np.array([c.variance_m2 for c in self._collected])
         self._collected, self._collected_s = [], math.inf
         f = self.filter
         if not math.isfinite(f.width_m) and len(self._nodes) > ONE_STRIP:
             f.widen(self._reach_m * REACH_SLACK)
+        slopes = f.with_delays(node, peer, common)
         apart_m, spread_m2 = f.antenna_pairs(node, peer)[:2]
         horizontal = excess + apart_m
         before, prior = f.pose.copy(), f.marginals()
@@ -475,7 +481,11 @@ class LargeTeam:
         return Estimate(time_s, tuple(nodes), self._pairs(), parameters=self._parameters(time_s))
 
     def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
-        """Return what ranges have in common; the team's figures stand beside every node."""
+        """Return what ranges have in common; the team's figures stand beside every node.
+
+        Antenna delays are each node's own, relative to the mean of the team, which ranges do not
+        tell from their common bias.
+        """
         terms, sigmas = self.filter.terms.tolist(), self.filter.sigma_of_terms().tolist()
         late_s = terms[CommonIndex.LATENESS] + self.clocks.lateness_s
         learned = (
@@ -483,8 +493,12 @@ class LargeTeam:
             ("range_lateness_s", late_s, sigmas[CommonIndex.LATENESS]),
             ("range_growth_m", terms[CommonIndex.GROWTH], sigmas[CommonIndex.GROWTH]),
         )
+        delays = zip(*(each.tolist() for each in self.filter.delays()), strict=True)
+        own = {n: (("antenna_delay_m", *d),) for n, d in zip(self._nodes, delays, strict=False)}
         return tuple(
-            Parameter(time_s, node, None, *one) for node in sorted(self._row) for one in learned
+            Parameter(time_s, node, None, *one)
+            for node in sorted(self._row)
+            for one in (*learned, *own.get(node, ()))
         )
 
     def _pairs(self) -> tuple[PairEstimate, ...]:

@@ -89,7 +89,10 @@ class NeighbourhoodFilter:
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
     terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
-    """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`)."""
+    """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`), then the
+    antenna delay (m) of each node, where they are modelled: T = 4 + N or 4."""
+    delay_sd_m: float = 0.0
+    """Standard deviation beforehand of a node's antenna delay; 0: not modelled."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
     terms_information: Floats = field(
@@ -130,7 +133,7 @@ class NeighbourhoodFilter:
         full = self._dense() if count else np.empty((0, 0))
         self.state = np.concatenate([self.state, np.pad(pose, ((0, 0), (0, 2)))])
         self.antenna_m = np.concatenate([self.antenna_m, np.zeros((more, 2))])
-        self._carried = np.concatenate([self._carried, np.zeros((more, COVARIANCE, TERMS))])
+        self._add_terms(more)
         self._lever = np.zeros((count + more, 3, 3))
         self._noise = np.zeros((count + more, len(kernels.ENTRIES)))
         whole = np.zeros((COVARIANCE * (count + more), COVARIANCE * (count + more)))
@@ -141,6 +144,19 @@ class NeighbourhoodFilter:
             for entry, sigma in enumerate(sigma_constants, at + 3):
                 whole[entry, entry] = sigma**2 + JITTER_CONSTANT
         self._lay_out(whole)
+
+    def _add_terms(self, more: int) -> None:
+        """Give so many more nodes antenna delays; where none are modelled, nobody has one."""
+        delays = more if self.delay_sd_m > 0.0 else 0
+        if not delays and len(self.terms) > TERMS:
+            self.terms, self._carried = self.terms[:TERMS], self._carried[..., :TERMS].copy()
+            known = np.linalg.inv(self.terms_information)[:TERMS, :TERMS]
+            self.terms_information = np.asarray(np.linalg.inv(known), np.float64)
+        count = len(self.terms)
+        self.terms = np.pad(self.terms, (0, delays))
+        self._carried = np.pad(self._carried, ((0, more), (0, 0), (0, delays)))
+        self.terms_information = np.pad(self.terms_information, (0, delays))
+        np.fill_diagonal(self.terms_information[count:, count:], self.delay_sd_m**-2 if delays else 0.0)
 
     def _lay_out(self, whole: Floats) -> None:
         """Choose the strips' direction and cut the covariance (5N, 5N) into blocks."""
@@ -214,12 +230,20 @@ class NeighbourhoodFilter:
     def update(self, node: Indices, peer: Indices, measured_m: Floats) -> Floats:
         """Use the ranges (E,) of one instant; return their probabilities of being no outliers."""
         same = np.ones(len(node))
-        slopes = np.zeros((len(node), TERMS))
+        slopes = np.zeros((len(node), len(self.terms)))
         outliers = np.zeros((len(node), 3))
         return self.update_with_terms(Ranges(node, peer, measured_m, same, outliers, slopes))
 
+    def with_delays(self, node: Indices, peer: Indices, slopes: Floats) -> Floats:
+        """Append to the slopes (E, 4) of ranges those in the antenna delays of both ends: (E, T)."""
+        slopes = np.pad(slopes, ((0, 0), (0, len(self.terms) - TERMS)))
+        if len(self.terms) > TERMS:
+            for end in (node, peer):
+                slopes[np.arange(len(node)), TERMS + end] = 1.0
+        return slopes
+
     def update_with_terms(self, ranges: Ranges) -> Floats:
-        """As :meth:`update`, ranges that have T terms in common (slopes (E, T)).
+        """As :meth:`update`, ranges that depend on T terms (slopes (E, T)).
 
         They are estimated in a second stage (Friedland 1969), which is exact for constants: with V
         the derivative of the states by them, an innovation depends on them by its slopes plus H V,
@@ -350,6 +374,17 @@ class NeighbourhoodFilter:
     def sigma_of_terms(self) -> Floats:
         """Return the terms' standard deviations (T,)."""
         return np.asarray(np.sqrt(np.linalg.inv(self.terms_information).diagonal()), np.float64)
+
+    def delays(self) -> tuple[Floats, Floats]:
+        """Return the nodes' antenna delays and their standard deviations (m), (N,) or empty.
+
+        They are relative to the mean of the team, of which ranges tell only the sum with the bias.
+        """
+        own, count = slice(TERMS, None), len(self.terms) - TERMS
+        differences = np.eye(count) - 1.0 / max(count, 1)
+        covariance = np.linalg.inv(self.terms_information)[own, own]
+        variance = (differences @ covariance @ differences).diagonal()
+        return differences @ self.terms[own], np.asarray(np.sqrt(variance), np.float64)
 
     # -- strips --------------------------------------------------------------------------------
 
