@@ -103,6 +103,44 @@ def update(
     turn_ways(state, covariance, moved[:, 2], pull[:, :2])
 
 
+def given_terms(joint: Floats, count: int) -> tuple[Floats, Floats]:
+    """Return the covariance (5N, 5N) of states if T terms were known, and their derivative (5N, T).
+
+    ``joint`` (5N + T, 5N + T) is the covariance of ``count`` nodes' states, then of the terms.
+    """
+    own, terms = slice(PER_NODE * count), slice(PER_NODE * count, None)
+    carried = joint[own, terms] @ np.linalg.inv(joint[terms, terms])
+    return joint[own, own] - carried @ joint[terms, own], carried
+
+
+def update_with_terms(
+    state: Floats,
+    terms: Floats,
+    joint: Floats,
+    ends: tuple[Indices, Indices],
+    measured: Floats,
+    slopes: Floats,
+    sigma_m: float,
+) -> None:
+    """Work in ranges (E,) that depend on T terms by slopes (E, T), too: states and terms at once.
+
+    Ways are not turned, and a range's curvature is that of the states if the terms were known.
+    """
+    distance, _, across, bearing = spread(state, given_terms(joint, len(state))[0], *ends)
+    middle = np.sqrt(distance**2 + across + NEAREST_M**2)
+    slope, e = distance / middle, np.arange(len(measured))
+    h = np.hstack([np.zeros((len(measured), state.size)), slopes])
+    for place, sign in zip(ends, (-1.0, 1.0), strict=True):
+        h[e, PER_NODE * place] += sign * slope * np.cos(bearing)
+        h[e, PER_NODE * place + 1] += sign * slope * np.sin(bearing)
+    noise = sigma_m**2 + 0.5 * (across / middle) ** 2
+    gain = joint @ h.T @ np.linalg.inv(h @ joint @ h.T + np.diag(noise))
+    moved = gain @ (measured - middle - slopes @ terms)
+    state += moved[: state.size].reshape(state.shape)
+    terms += moved[state.size :]
+    joint -= gain @ h @ joint
+
+
 def turn_ways(state: Floats, covariance: Floats, turn_rad: Floats, pull: Floats) -> None:
     """Turn what positions owe to step scales as headings were corrected (N,), in place.
 

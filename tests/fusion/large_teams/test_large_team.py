@@ -286,6 +286,32 @@ def test_what_the_team_has_in_common_is_learned_and_told(
     assert learned["body_shadow_m"] == pytest.approx(0.4 if condition == "shadow" else 0.0, abs=0.1)
 
 
+def test_a_tag_whose_ranges_are_all_too_long_is_no_surer_than_right() -> None:
+    """While tags had no antenna delays: 0.25 m, NEES 3.3."""
+    run = relpos.simulate("mission-base", 2, nodes=LARGE_TEAM + 1, seconds=35.0, range_rate_hz=0.3)
+    long = [
+        replace(m, range_m=m.range_m + 0.3) if isinstance(m, Range) and 3 in (m.node, m.peer) else m
+        for m in run.measurements
+    ]
+    truth = tracks.true_tracks(run.truth)
+    error_m, scaled = [], []
+    estimates = relpos.fuse(run, measurements=long).estimates
+    for e in estimates[20:]:
+        at = {
+            n: [np.interp(e.time_s, t.time_s, a) for a in (t.x_m, t.y_m)] for n, t in truth.items()
+        }
+        for p in (p for p in e.pairs if 3 in (p.node, p.peer)):
+            error_m.append(p.distance_m - math.dist(at[p.node], at[p.peer]))
+            scaled.append(error_m[-1] / p.sigma_distance_m)
+    assert math.sqrt(np.mean(np.square(error_m))) < 0.15
+    assert np.mean(np.square(scaled)) < 2.0
+    delays = {p.node: p for p in estimates[-1].parameters if p.name == "antenna_delay_m"}
+    assert len(delays) == LARGE_TEAM + 1
+    off = [(p.value - 0.3 * ((n == 3) - 1 / len(delays))) / p.sigma for n, p in delays.items()]
+    assert np.mean(np.square(off)) < 2.0
+    assert delays[3].sigma < 0.03
+
+
 def test_a_large_team_on_two_floors_without_heights_is_no_surer_than_right() -> None:
     """While the slant between floors counted as noise: 0.24 m, NEES 4.1."""
     run = relpos.simulate("mission-floors-no-heights", 1, nodes=LARGE_TEAM + 1, seconds=80.0)

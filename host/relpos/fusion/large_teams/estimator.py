@@ -71,7 +71,10 @@ ONE_STRIP = 50
 """Up to so many nodes are in one strip, where nothing is assumed of far ones, at no more time.
 
 ``mission-base``, area 10 + 1.25 n m, seed 4, processor time of 60 s in strips and in one: 24 people
-4.2 and 3.8 s, 40 6.5 and 6.3, 60 9.0 and 8.8; of 30 s: 100 people 5.7 and 8.0, 150 7.5 and 16.2."""
+4.2 and 3.8 s, 40 6.5 and 6.3, 60 9.0 and 8.8; of 30 s: 100 people 5.7 and 8.0, 150 7.5 and 16.2.
+
+Up to so many have antenna delays, too: T terms make as many right-hand sides, each of 2 N numbers.
+Who outgrow them have the terms that all ranges have in common, and no more."""
 
 REACH_SLACK = 1.05
 """Strips are this much wider than the longest range of the first instant."""
@@ -515,7 +518,10 @@ class LargeTeam:
         near[swap] = near[swap][:, ::-1]
         near = near[np.lexsort((ids[near[:, 1]], ids[near[:, 0]]))]
         near = near.astype(np.int64)
-        distance, along, across, bearing = self.filter.pairs(near[:, 0].copy(), near[:, 1].copy())
+        one, two = near[:, 0].copy(), near[:, 1].copy()
+        distance, along, across, bearing = self.filter.pairs(one, two)
+        unknown = self.filter.spread_of_terms(one, two, bearing)
+        along, across = along + unknown[0], across + unknown[1]
         bearing_rad2 = across / np.maximum(distance, 1e-9) ** 2 + self.filter.common[2, 2]
         sigma_bearing = np.minimum(np.sqrt(bearing_rad2), ANY_ANGLE_RAD)
         rows = zip(

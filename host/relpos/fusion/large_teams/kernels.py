@@ -200,7 +200,7 @@ class Ranges(NamedTuple):
     """(E, 3): probability that it is an outlier, at least; the part of it that repeats the pair's
     last one, and by how much that was too long (m)."""
     slopes: Floats
-    """(E, T): derivative by what all ranges have in common."""
+    """(E, T): derivative by what all ranges have in common, and by the antenna delays."""
 
 
 class RangeModel(NamedTuple):
@@ -223,7 +223,7 @@ def range_information(
     """Return the ranges of one instant as information about positions, at the present poses.
 
     ``pairs`` (4, E) are :func:`pair_moments`; ``carried`` (N, 5, T) is how the states depend on the
-    T terms that all ranges have in common. The result is the blocks of the information matrix A,
+    T terms, which many ranges have in common. The result is the blocks of the information matrix A,
     right-hand sides (2N, 1 + T) strip by strip as the blocks' rows, each range's probability of not
     being an outlier, by which its information is multiplied, and a line for each range: weight,
     slopes ux, uy, innovation, and the innovation's derivatives by the T terms. The right-hand sides

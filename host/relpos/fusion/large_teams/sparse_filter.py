@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.large_teams import chain, kernels
@@ -92,7 +93,8 @@ class NeighbourhoodFilter:
     """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`), then the
     antenna delay (m) of each node, where they are modelled: T = 4 + N or 4."""
     delay_sd_m: float = 0.0
-    """Standard deviation beforehand of a node's antenna delay; 0: not modelled."""
+    """Standard deviation beforehand of a node's antenna delay, by which its ranges are too long; 0:
+    delays are not modelled."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
     terms_information: Floats = field(
@@ -152,11 +154,10 @@ class NeighbourhoodFilter:
             self.terms, self._carried = self.terms[:TERMS], self._carried[..., :TERMS].copy()
             known = np.linalg.inv(self.terms_information)[:TERMS, :TERMS]
             self.terms_information = np.asarray(np.linalg.inv(known), np.float64)
-        count = len(self.terms)
         self.terms = np.pad(self.terms, (0, delays))
         self._carried = np.pad(self._carried, ((0, more), (0, 0), (0, delays)))
-        self.terms_information = np.pad(self.terms_information, (0, delays))
-        np.fill_diagonal(self.terms_information[count:, count:], self.delay_sd_m**-2 if delays else 0.0)
+        own = np.eye(delays) / (self.delay_sd_m**2 + JITTER_CONSTANT)
+        self.terms_information = np.asarray(block_diag(self.terms_information, own), np.float64)
 
     def _lay_out(self, whole: Floats) -> None:
         """Choose the strips' direction and cut the covariance (5N, 5N) into blocks."""
@@ -235,7 +236,7 @@ class NeighbourhoodFilter:
         return self.update_with_terms(Ranges(node, peer, measured_m, same, outliers, slopes))
 
     def with_delays(self, node: Indices, peer: Indices, slopes: Floats) -> Floats:
-        """Append to the slopes (E, 4) of ranges those in the antenna delays of both ends: (E, T)."""
+        """Append to ranges' slopes (E, 4) those in the antenna delays of both ends: (E, T)."""
         slopes = np.pad(slopes, ((0, 0), (0, len(self.terms) - TERMS)))
         if len(self.terms) > TERMS:
             for end in (node, peer):
@@ -248,7 +249,7 @@ class NeighbourhoodFilter:
         They are estimated in a second stage (Friedland 1969), which is exact for constants: with V
         the derivative of the states by them, an innovation depends on them by its slopes plus H V,
         and V changes by the gain times that. What they are not known to adds nothing to the
-        covariance.
+        covariance (:meth:`spread_of_terms`).
         """
         self._catch_up()
         node, peer = ranges.node, ranges.peer
@@ -370,6 +371,20 @@ class NeighbourhoodFilter:
         self.state[row, :2] += way_m
         self._noise[row, :3] += covariance[[0, 0, 1], [0, 1, 1]]
         self._behind = True
+
+    def spread_of_terms(self, node: Indices, peer: Indices, bearing_rad: Floats) -> Floats:
+        """Return what the errors of the T terms add to the variances of pairs (E,) (m^2): (2, E).
+
+        Along and across the line; nothing where the team has no delays.
+        """
+        if len(self.terms) == TERMS:
+            return np.zeros((2, len(node)))
+        self._catch_up()
+        x, y = (self._carried[peer, :2] - self._carried[node, :2]).swapaxes(0, 1)
+        c, s = np.cos(bearing_rad)[:, None], np.sin(bearing_rad)[:, None]
+        lines = np.stack([c * x + s * y, c * y - s * x])
+        spread: Floats = (lines @ np.linalg.inv(self.terms_information) * lines).sum(axis=2)
+        return spread
 
     def sigma_of_terms(self) -> Floats:
         """Return the terms' standard deviations (T,)."""
