@@ -14,7 +14,7 @@ class BankSettings:
     """Of the bank; one set for all scenarios and recordings.
 
     The filter that replaces it in a large team has one hypothesis, and learns less: of these it
-    uses ``scale``, ``drift_rad_s`` and ``bias_m``, and the times at the end.
+    uses ``scale``, ``drift_rad_s``, ``bias_m`` and ``pair_bias_m``, and the times at the end.
     """
 
     FORMER: ClassVar[Mapping[str, float]] = {
