@@ -17,6 +17,7 @@ from relpos.fusion.large_teams.sparse_filter import (
     JITTER_M2,
     TERMS,
     NeighbourhoodFilter,
+    OwnTerm,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -85,16 +86,16 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
     assert np.allclose(covariance_of(made), covariance, rtol=1e-6, atol=1e-10)
 
 
-def test_terms_and_antenna_delays_are_those_of_a_dense_filter_with_them_as_states() -> None:
+def test_terms_delays_and_clocks_are_those_of_a_dense_filter_with_them_as_states() -> None:
     rng = np.random.default_rng(7)
     pose = np.column_stack([rng.uniform(0, 12, (7, 2)), rng.uniform(-3, 3, 7)])
-    made = NeighbourhoodFilter(50.0, RangeModel(SIGMA_M), delay_sd_m=0.1)
+    made = NeighbourhoodFilter(50.0, RangeModel(SIGMA_M), own_sd=(0.1, 0.07))
     variance = np.array([0.09, 0.09, 0.01])
     # Without scales no ways are turned.
     for some in (pose[:5], pose[5:]):
         made.add(some.copy(), np.tile(np.diag(variance), (len(some), 1, 1)), (0.05, 0.0))
     state, covariance = dense_start(pose, [*variance, 0.05**2, 0.0])
-    terms = np.zeros(TERMS + 7)
+    terms = np.zeros(TERMS + 14)
     joint = block_diag(covariance, np.linalg.inv(made.terms_information))
     node, peer = np.triu_indices(7, 1)
     for _ in range(3):
@@ -103,12 +104,14 @@ def test_terms_and_antenna_delays_are_those_of_a_dense_filter_with_them_as_state
         dense.advance(state, joint, np.arange(7), moved)
         dense.wander(joint, np.arange(7), moved[:, 6])
         common = rng.normal(0.0, 1.0, (node.size, TERMS))
-        slopes = np.hstack([common, np.zeros((node.size, 7))])
-        for ends in (node, peer):
-            slopes[np.arange(node.size), TERMS + ends] += 1.0
-        assert (made.with_delays(node, peer, common) == slopes).all()
+        peer_m_s = rng.normal(0.0, 1.0, node.size)
+        slopes = np.hstack([common, np.zeros((node.size, 14))])
+        for ends, sign in ((node, -1.0), (peer, 1.0)):
+            slopes[np.arange(node.size), TERMS + 2 * ends] = 1.0
+            slopes[np.arange(node.size), TERMS + 2 * ends + 1] = sign * peer_m_s
+        assert (made.slopes_in_terms(node, peer, common, peer_m_s) == slopes).all()
         true = np.hypot(*(state[node, :2] - state[peer, :2]).T)
-        measured = true + rng.normal(0.0, SIGMA_M, node.size) + slopes[:, TERMS + 3] * 0.3
+        measured = true + rng.normal(0.0, SIGMA_M, node.size) + slopes[:, TERMS + 6] * 0.3
         sure, none = np.ones(node.size), np.zeros((node.size, 3))
         made.update_with_terms(Ranges(node, peer, measured, sure, none, slopes))
         dense.update_with_terms(state, terms, joint, (node, peer), measured, slopes, SIGMA_M)
@@ -123,30 +126,33 @@ def test_terms_and_antenna_delays_are_those_of_a_dense_filter_with_them_as_state
     added = made.spread_of_terms(node, peer, told[3])
     assert np.allclose(added, (whole - told)[1:3], atol=1e-6)
     assert added.max() > 0.01
-    delay_m, sigma_m = made.delays()
-    assert delay_m == pytest.approx(terms[TERMS:] - terms[TERMS:].mean(), abs=1e-5)
-    difference = np.eye(7)[3] - 1.0 / 7.0
-    variance_m2 = difference @ about_terms[TERMS:, TERMS:] @ difference
-    assert sigma_m[3] == pytest.approx(np.sqrt(variance_m2), rel=1e-3)
+    for term in OwnTerm:
+        own_terms, sigma = made.own_terms(term)
+        theirs = slice(TERMS + term, None, 2)
+        assert own_terms == pytest.approx(terms[theirs] - terms[theirs].mean(), abs=1e-5)
+        difference = np.eye(7)[3] - 1.0 / 7.0
+        variance = difference @ about_terms[theirs, theirs] @ difference
+        assert sigma[3] == pytest.approx(np.sqrt(variance), rel=1e-3)
 
 
-def test_a_team_that_outgrows_antenna_delays_keeps_what_all_ranges_have_in_common() -> None:
+def test_a_team_that_outgrows_delays_and_clocks_keeps_what_all_ranges_have_in_common() -> None:
     rng = np.random.default_rng(8)
     pose = np.column_stack([rng.uniform(0, 12, (6, 2)), np.zeros(6)])
-    made = NeighbourhoodFilter(50.0, RangeModel(SIGMA_M), delay_sd_m=0.1)
+    made = NeighbourhoodFilter(50.0, RangeModel(SIGMA_M), own_sd=(0.1, 0.07))
     variance = np.diag([0.09, 0.09, 0.01])
     made.add(pose[:5].copy(), np.tile(variance, (5, 1, 1)))
     node, peer = np.triu_indices(5, 1)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T) + 0.2
     ones, none = np.ones(node.size), np.zeros((node.size, 3))
-    slopes = made.with_delays(node, peer, rng.normal(0.0, 1.0, (node.size, TERMS)))
+    common = rng.normal(0.0, 1.0, (node.size, TERMS))
+    slopes = made.slopes_in_terms(node, peer, common, rng.normal(0.0, 1.0, node.size))
     made.update_with_terms(Ranges(node, peer, measured, ones, none, slopes))
     terms, sigma = made.terms[:TERMS], made.sigma_of_terms()[:TERMS]
-    made.delay_sd_m = 0.0
+    made.own_sd = ()
     made.add(pose[5:].copy(), variance[None])
     assert made.terms.tolist() == terms.tolist()
     assert made.sigma_of_terms() == pytest.approx(sigma)
-    assert made.delays()[0].size == 0
+    assert made.own_terms(OwnTerm.DELAY)[0].size == 0
     made.update(node, peer, measured)
 
 

@@ -34,7 +34,13 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges, displacements
 from relpos.fusion.large_teams.range_terms import slopes_of
-from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, prior_information
+from relpos.fusion.large_teams.sparse_filter import (
+    CLOCK_SD_S,
+    NeighbourhoodFilter,
+    OwnTerm,
+    own_term,
+    prior_information,
+)
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import base_variances
@@ -73,8 +79,9 @@ ONE_STRIP = 50
 ``mission-base``, area 10 + 1.25 n m, seed 4, processor time of 60 s in strips and in one: 24 people
 4.2 and 3.8 s, 40 6.5 and 6.3, 60 9.0 and 8.8; of 30 s: 100 people 5.7 and 8.0, 150 7.5 and 16.2.
 
-Up to so many have antenna delays, too: T terms make as many right-hand sides, each of 2 N numbers.
-Who outgrow them have the terms that all ranges have in common, and no more."""
+Up to so many have antenna delays and clocks of their own, too: T terms make as many right-hand
+sides, each of 2 N numbers. A team that outgrows them has what all ranges have in common, and no
+more."""
 
 REACH_SLACK = 1.05
 """Strips are this much wider than the longest range of the first instant."""
@@ -149,7 +156,7 @@ class LargeTeam:
             math.inf,
             model,
             terms_information=prior_information(self.settings.bias_m),
-            delay_sd_m=self.settings.pair_bias_m,
+            own_sd=(self.settings.pair_bias_m, CLOCK_SD_S),
         )
         known: list[Prior] = []
         for p in by_node(self.priors):
@@ -237,7 +244,7 @@ class LargeTeam:
         if not nodes:
             return
         if len(self._nodes) + len(nodes) > ONE_STRIP:
-            self.filter.delay_sd_m = 0.0
+            self.filter.own_sd = ()
         self.filter.add(poses, covariances, (self.settings.drift_rad_s, self.settings.scale))
         for node in nodes:
             self._row[node] = len(self._nodes)
@@ -253,8 +260,12 @@ class LargeTeam:
                 float(self.filter.terms[CommonIndex.LATENESS]),
                 float(self.filter.sigma_of_terms()[CommonIndex.LATENESS]),
             )
-            late_s, _ = self.clocks.slew(time_s - self._epoch_s, learned, {})
+            own = (each.tolist() for each in self.filter.own_terms(OwnTerm.CLOCK))
+            offsets = dict(zip(self._nodes, zip(*own, strict=True), strict=False))
+            late_s, steps = self.clocks.slew(time_s - self._epoch_s, learned, offsets)
             self.filter.terms[CommonIndex.LATENESS] -= late_s
+            for node, step_s in steps.items():
+                self.filter.terms[own_term(self._row[node], OwnTerm.CLOCK)] -= step_s
         timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
 
     # -- motion --------------------------------------------------------------------------------
@@ -360,7 +371,7 @@ class LargeTeam:
         f = self.filter
         if not math.isfinite(f.width_m) and len(self._nodes) > ONE_STRIP:
             f.widen(self._reach_m * REACH_SLACK)
-        slopes = f.with_delays(node, peer, common)
+        slopes = f.slopes_in_terms(node, peer, common[:, :-1], common[:, -1])
         apart_m, spread_m2 = f.antenna_pairs(node, peer)[:2]
         horizontal = excess + apart_m
         before, prior = f.pose.copy(), f.marginals()
@@ -486,8 +497,7 @@ class LargeTeam:
     def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
         """Return what ranges have in common; the team's figures stand beside every node.
 
-        Antenna delays are each node's own, relative to the mean of the team, which ranges do not
-        tell from their common bias.
+        Antenna delays and clocks are each node's own, relative to the mean of the team.
         """
         terms, sigmas = self.filter.terms.tolist(), self.filter.sigma_of_terms().tolist()
         late_s = terms[CommonIndex.LATENESS] + self.clocks.lateness_s
@@ -496,8 +506,14 @@ class LargeTeam:
             ("range_lateness_s", late_s, sigmas[CommonIndex.LATENESS]),
             ("range_growth_m", terms[CommonIndex.GROWTH], sigmas[CommonIndex.GROWTH]),
         )
-        delays = zip(*(each.tolist() for each in self.filter.delays()), strict=True)
-        own = {n: (("antenna_delay_m", *d),) for n, d in zip(self._nodes, delays, strict=False)}
+        delays, clocks = (self.filter.own_terms(term) for term in OwnTerm)
+        own: dict[int, list[tuple[str, float, float]]] = {}
+        for row, node in enumerate(self._nodes[: delays[0].size]):
+            offset_s = float(clocks[0][row]) + self.clocks.offset_s.get(node, 0.0)
+            own[node] = [
+                ("antenna_delay_m", float(delays[0][row]), float(delays[1][row])),
+                ("clock_offset_s", offset_s, float(clocks[1][row])),
+            ]
         return tuple(
             Parameter(time_s, node, None, *one)
             for node in sorted(self._row)

@@ -23,11 +23,12 @@ def slopes_of(
 ) -> tuple[float, ...]:
     """Return a range's slopes in what ranges have in common, in the order of ``CommonIndex``.
 
-    ``sight`` is the direction from the node to the peer; the others are the node's and the peer's.
+    Then the peer's velocity along the sight, by which clocks are multiplied. ``sight`` is the
+    direction from the node to the peer; the others are the node's and the peer's.
     """
     ends = zip(headings_rad, velocities_m_s, strict=True)
     own, other = (_along(sight, heading, velocity) for heading, velocity in ends)
-    return 1.0, shadow_slope(sight, *headings_rad), own - other, growth_slope(distance_m)
+    return 1.0, shadow_slope(sight, *headings_rad), own - other, growth_slope(distance_m), other
 
 
 def _along(sight: Vector, heading_rad: float, velocity_m_s: Vector) -> float:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,7 @@ from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+IndicesOrInt = Indices | int
 
 JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
 """Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of constants: what is exact
@@ -46,6 +48,19 @@ SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3
 Pairs have no biases here that shadows could be taken for, so that both may be larger than in the
 bank. 24 people, 100 s, seeds 14 and 15, with these and with the bank's .05 m and .1 s: ``shadow``
 .0680 and .0688 m, ``late-1`` .136 and .140, ``base`` and ``walls`` within .0006."""
+
+CLOCK_SD_S = 0.07
+"""Standard deviation beforehand of each clock's offset, as in the bank."""
+
+
+class OwnTerm(IntEnum):
+    """What of ranges is a node's own, in a team that is not too large."""
+
+    DELAY = 0
+    """Its antenna delay, by which its ranges are too long (m)."""
+    CLOCK = 1
+    """How far its clock is ahead (s)."""
+
 
 LEFT = np.diag([1e-6, 1e-6, 1e-7])
 """Covariance (m^2, rad^2) of the common motion that is left: blocks keep their inverses.
@@ -74,6 +89,11 @@ def prior_information(bias_sd_m: float) -> Floats:
     return information
 
 
+def own_term(row: IndicesOrInt, which: OwnTerm) -> IndicesOrInt:
+    """Return where a node's own term, or those of several (E,), are among all."""
+    return TERMS + len(OwnTerm) * row + which
+
+
 @dataclass(slots=True)
 class NeighbourhoodFilter:
     """States and covariance of a large team, arrays in and out.
@@ -90,11 +110,10 @@ class NeighbourhoodFilter:
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
     terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
-    """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`), then the
-    antenna delay (m) of each node, where they are modelled: T = 4 + N or 4."""
-    delay_sd_m: float = 0.0
-    """Standard deviation beforehand of a node's antenna delay, by which its ranges are too long; 0:
-    delays are not modelled."""
+    """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`), then
+    each node's own terms (:class:`OwnTerm`), where they are modelled: T = 4 + 2 N or 4."""
+    own_sd: tuple[float, ...] = ()
+    """Standard deviations beforehand of a node's own terms; none: they are not modelled."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
     terms_information: Floats = field(
@@ -148,16 +167,17 @@ class NeighbourhoodFilter:
         self._lay_out(whole)
 
     def _add_terms(self, more: int) -> None:
-        """Give so many more nodes antenna delays; where none are modelled, nobody has one."""
-        delays = more if self.delay_sd_m > 0.0 else 0
-        if not delays and len(self.terms) > TERMS:
+        """Give so many more nodes their own terms; where none are modelled, nobody has any."""
+        own = np.tile(self.own_sd, more)
+        if not own.size and len(self.terms) > TERMS:
             self.terms, self._carried = self.terms[:TERMS], self._carried[..., :TERMS].copy()
             known = np.linalg.inv(self.terms_information)[:TERMS, :TERMS]
             self.terms_information = np.asarray(np.linalg.inv(known), np.float64)
-        self.terms = np.pad(self.terms, (0, delays))
-        self._carried = np.pad(self._carried, ((0, more), (0, 0), (0, delays)))
-        own = np.eye(delays) / (self.delay_sd_m**2 + JITTER_CONSTANT)
-        self.terms_information = np.asarray(block_diag(self.terms_information, own), np.float64)
+        self.terms = np.pad(self.terms, (0, own.size))
+        self._carried = np.pad(self._carried, ((0, more), (0, 0), (0, own.size)))
+        information = np.diag(1.0 / (own**2 + JITTER_CONSTANT))
+        known = block_diag(self.terms_information, information)
+        self.terms_information = np.asarray(known, np.float64)
 
     def _lay_out(self, whole: Floats) -> None:
         """Choose the strips' direction and cut the covariance (5N, 5N) into blocks."""
@@ -235,12 +255,21 @@ class NeighbourhoodFilter:
         outliers = np.zeros((len(node), 3))
         return self.update_with_terms(Ranges(node, peer, measured_m, same, outliers, slopes))
 
-    def with_delays(self, node: Indices, peer: Indices, slopes: Floats) -> Floats:
-        """Append to ranges' slopes (E, 4) those in the antenna delays of both ends: (E, T)."""
-        slopes = np.pad(slopes, ((0, 0), (0, len(self.terms) - TERMS)))
+    def slopes_in_terms(
+        self, node: Indices, peer: Indices, common: Floats, peer_m_s: Floats
+    ) -> Floats:
+        """Return the slopes of ranges in all terms (E, T).
+
+        ``common`` (E, 4) are those in what all have in common, ``peer_m_s`` (E,) the peers'
+        velocities along the sight: the node's clock dates a range, its peer is seen where it was
+        when that clock was right, if its own is (``fusion/bank/range_update.py``).
+        """
+        slopes = np.pad(common, ((0, 0), (0, len(self.terms) - TERMS)))
         if len(self.terms) > TERMS:
-            for end in (node, peer):
-                slopes[np.arange(len(node)), TERMS + end] = 1.0
+            ranges = np.arange(len(node))
+            for end, speed_m_s in ((node, -peer_m_s), (peer, peer_m_s)):
+                slopes[ranges, own_term(end, OwnTerm.DELAY)] = 1.0
+                slopes[ranges, own_term(end, OwnTerm.CLOCK)] = speed_m_s
         return slopes
 
     def update_with_terms(self, ranges: Ranges) -> Floats:
@@ -375,7 +404,7 @@ class NeighbourhoodFilter:
     def spread_of_terms(self, node: Indices, peer: Indices, bearing_rad: Floats) -> Floats:
         """Return what the errors of the T terms add to the variances of pairs (E,) (m^2): (2, E).
 
-        Along and across the line; nothing where the team has no delays.
+        Along and across the line; nothing where nodes have no terms of their own.
         """
         if len(self.terms) == TERMS:
             return np.zeros((2, len(node)))
@@ -390,14 +419,14 @@ class NeighbourhoodFilter:
         """Return the terms' standard deviations (T,)."""
         return np.asarray(np.sqrt(np.linalg.inv(self.terms_information).diagonal()), np.float64)
 
-    def delays(self) -> tuple[Floats, Floats]:
-        """Return the nodes' antenna delays and their standard deviations (m), (N,) or empty.
+    def own_terms(self, which: OwnTerm) -> tuple[Floats, Floats]:
+        """Return one of the nodes' own terms and its standard deviations, (N,) or empty.
 
-        They are relative to the mean of the team, of which ranges tell only the sum with the bias.
+        They are relative to the mean of the team, of which ranges do not tell more.
         """
-        own, count = slice(TERMS, None), len(self.terms) - TERMS
-        differences = np.eye(count) - 1.0 / max(count, 1)
-        covariance = np.linalg.inv(self.terms_information)[own, own]
+        own = np.arange(TERMS + which, len(self.terms), len(OwnTerm))
+        differences = np.eye(own.size) - 1.0 / max(own.size, 1)
+        covariance = np.linalg.inv(self.terms_information)[np.ix_(own, own)]
         variance = (differences @ covariance @ differences).diagonal()
         return differences @ self.terms[own], np.asarray(np.sqrt(variance), np.float64)
 
