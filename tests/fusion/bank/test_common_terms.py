@@ -88,7 +88,7 @@ def test_in_a_team_of_more_than_six_both_antenna_delays_are_in_a_range() -> None
     these = core.hypotheses
     common, *delays = these.bias_entries(np.array([4]), np.array([2]))[0].tolist()
     x, p = these.dense()
-    assert p[:, delays, delays] == pytest.approx(settings.pair_bias_m**2)
+    assert p[:, delays, delays] == pytest.approx((0.5 * settings.pair_bias_m) ** 2)
     x[:, delays] = 0.2, -0.3
     these.store(x, p)
     slope = reference.common_terms(x[0], p[0], nodes, 4, 2, np.zeros((2, 2)))

@@ -31,7 +31,7 @@ from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
-from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex
+from relpos.fusion.models.ranging import DELAY_SHARE, GROWTH_SD_M, CommonIndex
 from relpos.fusion.resampling import systematic
 from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
@@ -362,7 +362,7 @@ class HypothesisSet:
             self.common_entry(CommonIndex.GROWTH): GROWTH_SD_M,
         }
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
-        priors |= dict.fromkeys(self.delays.values(), self.settings.pair_bias_m)
+        priors |= dict.fromkeys(self.delays.values(), DELAY_SHARE * self.settings.pair_bias_m)
         block, lane = self.at(which)
         p, has = self.arrays.p, self.models.has_biases[which]
         for entry, sigma in priors.items():
@@ -457,7 +457,8 @@ class HypothesisSet:
                 continue
             for user in (a, b):
                 if user not in self.delays:
-                    variance = self.models.has_biases * self.settings.pair_bias_m**2
+                    sigma_m = DELAY_SHARE * self.settings.pair_bias_m
+                    variance = self.models.has_biases * sigma_m**2
                     none = np.zeros_like(self.arrays.has_heights)
                     self.delays[user] = self._add_bias(none, variance)
             entries[r] = common, self.delays[a], self.delays[b]

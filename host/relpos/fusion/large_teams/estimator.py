@@ -46,6 +46,7 @@ from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
+    DELAY_SHARE,
     CommonIndex,
     Mounting,
     OutlierPersistence,
@@ -156,7 +157,7 @@ class LargeTeam:
             math.inf,
             model,
             terms_information=prior_information(self.settings.bias_m),
-            own_sd=(self.settings.pair_bias_m, CLOCK_SD_S),
+            own_sd=(DELAY_SHARE * self.settings.pair_bias_m, CLOCK_SD_S),
         )
         known: list[Prior] = []
         for p in by_node(self.priors):
