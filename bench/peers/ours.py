@@ -71,7 +71,7 @@ class JointAlone(Joint):
         count = ranges.node.size
         those = range_update.Ranges(
             ranges.node, ranges.peer, ranges.range_m, np.zeros(count), np.zeros(count),
-            np.ones(count), np.zeros(count), np.full(count, -1), np.zeros((count, 4)),
+            np.ones(count), np.zeros(count), np.full((count, 3), -1), np.zeros((count, 4)),
             np.tile([self.outlier[0], 0.0, 0.0], (count, 1)),
         )  # fmt: skip
         model = range_update.RangeModel(self.outlier, np.zeros((0, 2)))
