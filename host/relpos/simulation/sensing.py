@@ -29,7 +29,7 @@ ROOM_M = 10.0
 """Distance of the walls from each other, both ways, where there are walls."""
 
 DISTURBED = 1
-"""The user whose node restarts, loses its motion or has another clock."""
+"""The user whose node restarts, loses its motion or has another clock, or who is carried."""
 
 EXCESS_M = (0.5, 3.0)
 """A link without line of sight is too long by so much; redrawn every ``EXCESS_HELD_S``."""
@@ -63,11 +63,13 @@ class SensingSettings:
     walls: int = setting(0, "1: walls every 10 m lose and delay ranges", 0, 1)
     nlos_share: float = setting(0.0, "links without line of sight in one half", 0.0, 1.0)
     shadow_m: float = setting(0.0, "most that two bodies lengthen a range", 0.0, 10.0)
+    delay_m: float = setting(0.0, "spread of the tags' antenna delays", 0.0, 10.0)
     range_late_s: float = setting(0.0, "ranges are dated so much late", 0.0, 10.0)
     clock_off_s: float = setting(0.0, "one node's clock is ahead by so much", -10.0, 10.0)
     gap_s: float = setting(0.0, "once a minute a node reports no motion for so long", 0.0, 50.0)
     lost_s: float = setting(0.0, "one node's motion is lost for so long at half-time", 0.0, 600.0)
     reboot_s: float = setting(0.0, "one node is off for so long at half-time", 0.0, 600.0)
+    carried_s: float = setting(0.0, "one is carried for so long at half-time", 0.0, 600.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +158,10 @@ def motions(settings: SensingSettings, truth: Walk, rng: np.random.Generator) ->
         turned = turn + noise_rad * normals[2] * (way > 0.0)
         turned += settings.turn_noise * turn * normals[3] + drift_rad_s * duration_s
         off_s = settings.clock_off_s if node == DISTURBED else 0.0
+        if node == DISTURBED:
+            # Who is carried takes no steps, and turns.
+            walks = (time_s < middle_s) | (time_s >= middle_s + settings.carried_s)
+            x, y = x * walks, y * walks
         outage_s = max(settings.lost_s, settings.reboot_s) if node == DISTURBED else 0.0
         pending, pending_turn, pending_steps = 0j, 0.0, 0
         for k, (t, dx, dy, angle) in enumerate(zip(time_s, x, y, turned, strict=True)):
@@ -187,7 +193,9 @@ def ranges(
     middle_s = 0.5 * settings.seconds
     count = len(truth.position_m)
     pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
-    for (a, b), one in zip(pairs, rng.spawn(len(pairs)), strict=True):
+    *each, own = rng.spawn(len(pairs) + 1)
+    delay_m = settings.delay_m * own.standard_normal(count)
+    for (a, b), one in zip(pairs, each, strict=True):
         count = one.poisson(settings.range_rate_hz * settings.seconds)
         time_s = np.sort(one.uniform(0.0, settings.seconds, count))
         lost, first = one.random(count), np.where(one.random(count) < 0.5, a, b)
@@ -199,7 +207,7 @@ def ranges(
         line = of[:, :2] - at[:, :2]
         flat_m = np.hypot(*line.T)
         true_m = np.hypot(flat_m, truth.height_at(b, time_s) - truth.height_at(a, time_s))
-        range_m = true_m + noise_m + _shadow(settings.shadow_m, at, of)
+        range_m = true_m + noise_m + _shadow(settings.shadow_m, at, of) + delay_m[a] + delay_m[b]
         in_half = at[:, 0] < 0.5 * settings.area_m
         range_m += in_half * excess_m[(time_s / EXCESS_HELD_S).astype(int)]
         heard = true_m < settings.max_range_m
