@@ -86,6 +86,32 @@ def test_a_shadow_only_lengthens_and_never_by_more_than_it_says() -> None:
     assert 0.5 < max(longer) <= 0.8 + 1e-9
 
 
+def test_a_range_is_longer_by_the_antenna_delays_of_both_tags() -> None:
+    plain = [m for m in mission("base").measurements if isinstance(m, Range)]
+    delayed = [m for m in mission("delays").measurements if isinstance(m, Range)]
+    longer_m: dict[tuple[int, ...], list[float]] = {}
+    for a, b in zip(plain, delayed, strict=True):
+        if a.range_m > 2.0:
+            pair = tuple(sorted((a.node, a.peer)))
+            longer_m.setdefault(pair, []).append(b.range_m - a.range_m)
+    of = {pair: np.mean(those) for pair, those in longer_m.items()}
+    assert max(np.ptp(those) for those in longer_m.values()) < 1e-9
+    assert of[1, 2] + of[3, 4] == pytest.approx(of[1, 3] + of[2, 4])
+    assert 0.05 < np.std(list(of.values())) < 0.6
+
+
+def test_who_is_carried_reports_to_turn_and_not_to_step() -> None:
+    plain, carried = (
+        [m for m in mission(name).measurements if isinstance(m, Motion)]
+        for name in ("base", "carried")
+    )
+    for a, b in zip(plain, carried, strict=True):
+        if a.node == 2 and a.time_s >= 30.0:
+            assert (b.dx_m, b.dy_m, b.dtheta_rad) == (0.0, 0.0, a.dtheta_rad)
+        else:
+            assert a == b
+
+
 def test_half_of_the_team_is_away_while_the_team_is_split() -> None:
     run = simulate("mission-split", 2, {"seconds": 600, "split_s": 300})
     apart_m = np.linalg.norm(true_m(run, 1, 400.0) - true_m(run, 6, 400.0))
