@@ -18,7 +18,6 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import mixture
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_models import PAIR_BIASES
@@ -52,6 +51,7 @@ from relpos.fusion.models.ranging import (
     RangeCorrelation,
     Repeats,
     antenna_m,
+    deviations_within,
     slab_variance,
     slant_height,
 )
@@ -299,10 +299,8 @@ class Bank:
         self._end_instant(time_s)
 
     def _end_instant(self, time_s: float) -> None:
-        faulty, stands = self.core.faulty_row, False
-        for node, row in self._row.items():
-            if row == faulty:
-                stands = self._known[node].contradict(time_s)
+        faulty = [node for node, row in self._row.items() if row == self.core.faulty_row]
+        stands = any(self._known[node].contradict(time_s) for node in faulty)
         self.core.end_instant(time_s, turned=not stands)
 
     def _repeats(self, pairs: Sequence[tuple[int, int]]) -> Repeats:
@@ -540,7 +538,7 @@ class Bank:
         lateness = these.common_entry(CommonIndex.LATENESS)
         sigma_s = math.sqrt(max(float(covariance[lateness, lateness]), 0.0))
         clocks = these.clock_entries()
-        offset_s, sigmas_s = mean[clocks], mixture.deviations_within(covariance, clocks)
+        offset_s, sigmas_s = mean[clocks], deviations_within(covariance, clocks)
         usual_s = median(offset_s.tolist()) if rows else 0.0
         offsets = {n: (offset_s[row] - usual_s, sigmas_s[row]) for n, row in rows.items()}
         late_s, steps = self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)

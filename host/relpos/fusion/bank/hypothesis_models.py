@@ -18,10 +18,10 @@ PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
 Of more, each user has its antenna's delay."""
 
-SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.05, 0.1, 0.07
-"""Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
-each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.16 so).
-0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
+SHADOW_SD_M, LATENESS_SD_S = 0.05, 0.1
+"""Prior standard deviations of what a body adds to a range, and of how late ranges are dated. Far
+larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.16 so). 0.3 of each, and of
+clocks, learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
 shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
 
 STOREY_M2 = 9.0

@@ -12,7 +12,6 @@ from relpos.errors import RelposError
 from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.hypothesis_models import (
-    CLOCK_SD_S,
     LATENESS_SD_S,
     LEAST_WEIGHT,
     PAIR_BIASES,
@@ -31,7 +30,7 @@ from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
-from relpos.fusion.models.ranging import DELAY_SHARE, GROWTH_SD_M, CommonIndex
+from relpos.fusion.models.ranging import CLOCK_SD_S, DELAY_SHARE, GROWTH_SD_M, CommonIndex
 from relpos.fusion.resampling import systematic
 from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
@@ -48,7 +47,7 @@ class HypothesisSet:
     Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 4 + pairs
     entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
     common (:class:`~relpos.fusion.models.ranging.CommonIndex`), each user's clock offset, and the
-    range bias of each pair when it is first ranged (in large teams the antenna delay of each user).
+    range bias of each pair when it is first ranged (of more than six users, each antenna's delay).
     """
 
     def __init__(
@@ -351,7 +350,7 @@ class HypothesisSet:
 
     def clock_entries(self) -> Indices:
         """Return the entries of all users' clock offsets (N,)."""
-        return PER_NODE * self.nodes + COMMON + np.arange(self.nodes)
+        return self.clock_entry(0) + np.arange(self.nodes)
 
     def _allow_common(self, which: Indices) -> None:
         """Let those of ``which`` (M,) that have biases model what ranges have in common."""

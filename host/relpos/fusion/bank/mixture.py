@@ -138,14 +138,3 @@ def moments(
             variance = variance + load(weight, b) * (own + away * away)
         cov[of[i], of[i]] = lanes.total(variance)
     return mean, cov
-
-
-def deviations_within(covariance: Floats, entries: Indices) -> Floats:
-    """Return deviations (M,) of entries relative to the mean of them all, by the moments (D, D).
-
-    Of clocks and antennas ranges say how they differ, and no more.
-    """
-    own = np.eye(len(entries)) - 1.0 / max(len(entries), 1)
-    spread = (own @ covariance[np.ix_(entries, entries)] @ own).diagonal()
-    deviations: Floats = np.sqrt(np.maximum(spread, 0.0))
-    return deviations

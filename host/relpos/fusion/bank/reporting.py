@@ -16,7 +16,7 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import mixture, storage
+from relpos.fusion.bank import storage
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
@@ -38,7 +38,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.ranging import RANGE_SCALE_SD, CommonIndex
+from relpos.fusion.models.ranging import RANGE_SCALE_SD, CommonIndex, deviations_within
 from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
@@ -229,7 +229,7 @@ class Report:
         growth = learned(CommonIndex.GROWTH)
         late = lateness + clocks.lateness_s, sigma
         entries = these.clock_entries()
-        offsets, sigmas = self.mean[entries], mixture.deviations_within(self.covariance, entries)
+        offsets, sigmas = self.mean[entries], deviations_within(self.covariance, entries)
         offset = {n: float(offsets[self.row[n]]) + clocks.offset_s.get(n, 0.0) for n in nodes}
         # Ranges say how clocks differ, and most are right.
         usual = median(offset.values())
@@ -251,7 +251,7 @@ class Report:
         delays = self.core.hypotheses.delays
         entries = np.array(list(delays.values()), dtype=np.int64)
         named = {row: node for node, row in self.row.items()}
-        sigmas = mixture.deviations_within(self.covariance, entries).tolist()
+        sigmas = deviations_within(self.covariance, entries).tolist()
         values = self.mean[entries] - self.mean[entries].mean() if delays else entries
         return [
             Parameter(self.time_s, named[row], None, "antenna_delay_m", value, sigma)

@@ -35,7 +35,6 @@ from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges, displacements
 from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import (
-    CLOCK_SD_S,
     NeighbourhoodFilter,
     OwnTerm,
     own_term,
@@ -46,6 +45,7 @@ from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
+    CLOCK_SD_S,
     DELAY_SHARE,
     CommonIndex,
     Mounting,

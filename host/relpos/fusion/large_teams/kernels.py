@@ -200,7 +200,7 @@ class Ranges(NamedTuple):
     """(E, 3): probability that it is an outlier, at least; the part of it that repeats the pair's
     last one, and by how much that was too long (m)."""
     slopes: Floats
-    """(E, T): derivative by what all ranges have in common, and by the antenna delays."""
+    """(E, T): derivative by what all ranges have in common, and by what is each node's own."""
 
 
 class RangeModel(NamedTuple):

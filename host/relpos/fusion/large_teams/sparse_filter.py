@@ -30,7 +30,7 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.large_teams import chain, kernels
 from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
-from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex
+from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex, deviations_within
 from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
 Floats = npt.NDArray[np.float64]
@@ -48,9 +48,6 @@ SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3
 Pairs have no biases here that shadows could be taken for, so that both may be larger than in the
 bank. 24 people, 100 s, seeds 14 and 15, with these and with the bank's .05 m and .1 s: ``shadow``
 .0680 and .0688 m, ``late-1`` .136 and .140, ``base`` and ``walls`` within .0006."""
-
-CLOCK_SD_S = 0.07
-"""Standard deviation beforehand of each clock's offset, as in the bank."""
 
 
 class OwnTerm(IntEnum):
@@ -425,10 +422,10 @@ class NeighbourhoodFilter:
         They are relative to the mean of the team, of which ranges do not tell more.
         """
         own = np.arange(TERMS + which, len(self.terms), len(OwnTerm))
-        differences = np.eye(own.size) - 1.0 / max(own.size, 1)
-        covariance = np.linalg.inv(self.terms_information)[np.ix_(own, own)]
-        variance = (differences @ covariance @ differences).diagonal()
-        return differences @ self.terms[own], np.asarray(np.sqrt(variance), np.float64)
+        value = self.terms[own]
+        covariance = np.asarray(np.linalg.inv(self.terms_information), np.float64)
+        sigma = deviations_within(covariance, own)
+        return value - value.sum() / max(own.size, 1), sigma
 
     # -- strips --------------------------------------------------------------------------------
 

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 class CommonIndex(IntEnum):
@@ -102,10 +103,25 @@ def slab_variance(floors: Sequence[tuple[int | None, int | None]]) -> Floats:
     return (SIGMA_SLAB_M * slabs) ** 2
 
 
+def deviations_within(covariance: Floats, entries: Indices) -> Floats:
+    """Return deviations (M,) of entries relative to the mean of them all, by a covariance (D, D).
+
+    Of clocks and antennas ranges say how they differ, and no more.
+    """
+    own = np.eye(len(entries)) - 1.0 / max(len(entries), 1)
+    spread = (own @ covariance[np.ix_(entries, entries)] @ own).diagonal()
+    deviations: Floats = np.sqrt(np.maximum(spread, 0.0))
+    return deviations
+
+
 DELAY_SHARE = 0.5
 """Standard deviation of a tag's antenna delay, relative to that of a pair's part of the bias: both
 tags make it. 21 people, 0.3 ranges a second, 45 s, seed 21, no delays: 0.130 m so, 0.132 with 1;
 one tag that is off by 0.3 m is found alike."""
+
+CLOCK_SD_S = 0.07
+"""Prior standard deviation of each clock's offset. Far larger ones are learned, too. A large team
+with 0.03 finds one that is a second off too late (docs/notebook/large-teams.md)."""
 
 GROWTH_SD_M, GROWTH_LEAST_M, GROWTH_USUAL_M = 0.1, 1.0, 5.0
 """A chip's range error depends on the signal's strength, so that ranges grow with the logarithm of
