@@ -40,7 +40,7 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
         core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
     these = core.hypotheses
     pair = np.array([0]), np.array([2])
-    entry = int(these.bias_entries(*pair)[0, 0])
+    entry = int(these.biases.entries(*pair)[0, 0])
     x, p = these.dense()
     common = PER_NODE * NODES
     x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
@@ -86,7 +86,8 @@ def test_in_a_team_of_more_than_six_both_antenna_delays_are_in_a_range() -> None
     for n in range(nodes):
         core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
     these = core.hypotheses
-    common, *delays = these.bias_entries(np.array([4]), np.array([2]))[0].tolist()
+    these.biases.know_heights()
+    common, *delays = these.biases.entries(np.array([4]), np.array([2]))[0].tolist()
     x, p = these.dense()
     assert p[:, delays, delays] == pytest.approx((0.5 * settings.pair_bias_m) ** 2)
     x[:, delays] = 0.2, -0.3
@@ -128,7 +129,7 @@ def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
     for n in range(2):
         core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    these.bias_entries(np.array([0]), np.array([1]))
+    these.biases.entries(np.array([0]), np.array([1]))
     x, p = these.dense()
     x[:, PER_NODE * 2 :] = np.arange(x.shape[1] - PER_NODE * 2)
     these.store(x, p)
@@ -136,7 +137,7 @@ def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
     x, _ = these.dense()
     assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0, 3.0]
     assert [x[0, these.clock_entry(row)] for row in range(3)] == [4.0, 5.0, 0.0]
-    assert x[0, these.biases[0, 1]] == 6.0
+    assert x[0, these.biases.pairs[0, 1]] == 6.0
 
 
 @pytest.mark.parametrize(
@@ -281,7 +282,7 @@ def test_each_kind_of_range_error_keeps_hypotheses_and_some_weight() -> None:
     for n in range(NODES):
         core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    these.bias_entries(np.array([0]), np.array([1]))
+    these.biases.entries(np.array([0]), np.array([1]))
     these.log_weight[:] -= 60.0 * these.models.has_biases
     for _ in range(5):
         these.resample(these.weights())

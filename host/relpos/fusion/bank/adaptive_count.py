@@ -157,6 +157,8 @@ class AdaptiveCount:
         heights = float(unperturbed.reshape(-1)[: these.count] @ has_heights) > 0.5
         # What a pair's entry is has to be the same in all.
         left_out = (these.perturbed > 0.0) | (has_heights != heights)
+        if heights and these.biases.users:
+            these.biases.mirror_heights()
         these.log_weight[:] -= np.where(left_out, PERTURBED_LOSS, 0.0)
         mean, covariance = these.moments()
         before, weight = these.sampled_share, these.weights()

@@ -154,11 +154,10 @@ class BankCore:
         repeats: Repeats | None = None,
         velocity_m_s: Floats | None = None,
         outliers: Floats | None = None,
-    ) -> tuple[Floats, Floats, Floats]:
+    ) -> tuple[Floats, Floats]:
         """Update with the ranges (R,) of one instant; return what of each is an outlier.
 
-        That is its inlier probability (R,), and by how much it is off if it is none (m). Then its
-        innovation over its deviation.
+        That is its inlier probability (R,), and by how much it is off if it is none (m).
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``repeats`` what of the pairs' last errors they repeat (nothing by default),
@@ -170,7 +169,7 @@ class BankCore:
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
         counts, kept = repeats or Repeats(np.ones(several), np.zeros(several))
         self._check(first, second, range_m, dz_m, variance, counts)
-        biases = these.bias_entries(first, second)
+        biases = these.biases.entries(first, second)
         velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
         outlier, known = self._sensors.model.outlier, self._sensors
         usual = np.full(several, sensors.expect_outliers(known.outlier_counts, outlier))
@@ -243,6 +242,7 @@ class BankCore:
         A user with an odometry fault may have ``turned``.
         """
         these, relocalisation = self.hypotheses, self.relocalisation
+        these.biases.climb(time_s)
         known = self._sensors
         share = sensors.expect_outliers(known.outlier_counts, known.model.outlier)
         usual = max(sensors.ODD_SHARE, sensors.ODD_SHARE_OF_OUTLIERS * share)

@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
-from relpos.fusion.bank.hypothesis_models import PAIR_BIASES
 from relpos.fusion.bank.mirrored import open_nodes
 from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
@@ -187,7 +186,7 @@ class Bank:
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
                 known.worn_m = worn.height_m
-                self.core.hypotheses.know_heights()
+                self.core.hypotheses.biases.know_heights()
                 known.vertical = Vertical(worn.height_m)
         return known
 
@@ -283,12 +282,10 @@ class Bank:
             ]
             outliers = self.outliers.expected(time_s, pairs)
             before = self._unseen(ends, time_s)
-            inlier, excess_m, innovation = self.core.update(
+            inlier, excess_m = self.core.update(
                 first, second, measured, dz, variance, repeats, np.array(velocity), outliers
             )
             self.outliers.learn(time_s, pairs, inlier, excess_m)
-            if len(located) > PAIR_BIASES:
-                self.range_correlation.learn(pairs, innovation, inlier)
             self._ranges_used += len(ranges)
             for (walk, place, spread), (_, moved, left) in zip(
                 before, self._unseen(ends, time_s), strict=True
@@ -476,7 +473,7 @@ class Bank:
         measured = step.measurement
         if isinstance(measured, Height):
             self._counters["heights_stuck"] += not self.vertical.measure(measured, step.time_s)
-            self.core.hypotheses.know_heights()
+            self.core.hypotheses.biases.know_heights()
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()
             self._turn(step.time_s, measured, self._row[measured.node])

@@ -16,6 +16,7 @@ second, the velocities v and the headings n (a body shadows who is behind it)
               - lateness u (v_j - v_i) - (clock_i - clock_j) u v_j + growth log(m / 5 m)
 
 as the first, whose clock dates the range, sees the second where it was when that clock was right.
+Where heights are unknown dz has them, and a user's height the slope dz/m.
 Reference implementation: :mod:`reference.joint`.
 """
 
@@ -291,6 +292,46 @@ def _common_terms(
 
 
 @inner
+def _unknown_height(block: Block, bias: Indices, has: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Return the square of an unknown difference of height, the difference, and its variance.
+
+    Of a pair's own entry, which holds the square, the latter are 0, as all are where ``has`` is.
+    """
+    x, p, at_x, base, _ = block
+    i, j = bias[1], bias[2]
+    if i < 0:
+        return has * greater(load(x, at_x + bias[0]), fill(0.0)), fill(0.0), fill(0.0)
+    spread = load(p, base + place(i, i)) + load(p, base + place(j, j))
+    spread = has * greater(spread - 2.0 * load(p, base + place(i, j)), fill(0.0))
+    higher = has * (load(x, at_x + j) - load(x, at_x + i))
+    return higher * higher, higher, spread
+
+
+@inner
+def _height_terms(
+    slope: Floats, entry: Indices, bias: Indices, common: int, has: Lanes,
+    lifted: tuple[Lanes, Lanes], ranges: tuple[Lanes, float],
+) -> tuple[int, Lanes]:  # fmt: skip
+    """Have entries of :func:`_common_terms` be heights where ``has``; return how many there are.
+
+    And what the predicted range has of their mean. ``lifted`` are the square and the difference,
+    ``ranges`` the predicted and the measured one (m).
+    """
+    (square, higher), (m, range_m), seen = lifted, ranges, load(slope, 0)
+    if bias[1] >= 0:
+        per_m = higher / m
+        store(slope, 6, (1.0 - has) * seen - per_m)
+        store(slope, 7, (1.0 - has) * seen + per_m)
+        return 8, higher * per_m
+    # m^2 is linear in the square of the height: its slope is that of the chord.
+    chord = has / (m + greater(fill(range_m), fill(0.0)))
+    entry[6] = common
+    store(slope, 6, has * seen)
+    store(slope, 0, chord + (1.0 - has) * seen)
+    return 7, chord * square
+
+
+@inner
 def _add_terms(
     block: Block, slope: Floats, entry: Indices, terms: int, g: Floats
 ) -> tuple[Lanes, Lanes]:
@@ -428,14 +469,12 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             i, j = POSE * first, POSE * second
             # What is common to all comes before a pair's own entry.
             bias = ranges.bias[r, 0]
-            own_entry = bias >= own
-            if passes and own_entry:
+            if passes and bias >= own:
                 _pass_bias(block, bias, common, ranges.kept[r], passing)
-            heights_here = heights and own_entry
-            dz2, lifted = fill(dz * dz), fill(0.0)
-            if heights_here:
-                lifted = has_heights * greater(load(x, block.at_x + bias), lifted)
-                dz2 = dz2 + lifted
+            square, higher, vague_height = fill(0.0), fill(0.0), fill(0.0)
+            if heights and bias >= 0:
+                square, higher, vague_height = _unknown_height(block, ranges.bias[r], has_heights)
+            dz2 = fill(dz * dz) + square + vague_height
             if model.lever_m.shape[0] > 0:
                 levers = (model.lever_m[first], model.lever_m[second])
                 m, v, gx, gy = _predict_by_lever(block, i, j, dz2, levers, off, g)
@@ -453,14 +492,13 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 users, sight = (nodes, first, second), (gx, gy, m, seen)
                 velocity = ranges.velocity_m_s[r]
                 terms = _common_terms(block, users, velocity, ranges.bias[r], sight, slope, entry)
-                if heights_here:
-                    # m^2 is linear in the square of the height: its slope is that of the chord.
-                    chord = has_heights / (m + greater(fill(ranges.range_m[r]), fill(0.0)))
-                    entry[6], terms = common, 7
-                    store(slope, 6, has_heights * seen)
-                    store(slope, 0, chord + (1.0 - has_heights) * seen)
-                    # What the mean has of it is in m.
-                    innovation = innovation + chord * lifted
+                if heights:
+                    lifted, seen_m = (square, higher), (m, ranges.range_m[r])
+                    terms, known = _height_terms(
+                        slope, entry, ranges.bias[r], common, has_heights, lifted, seen_m
+                    )
+                    innovation = innovation + known
+                    v = v + 0.5 * vague_height * vague_height / (m * m)
                 length, added = _add_terms(block, slope, entry, terms, g)
                 innovation = innovation - length
                 v = v + added

@@ -16,11 +16,10 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import storage
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
-from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mirrored import VAGUE_RAD
+from relpos.fusion.bank.range_biases import Learned
 from relpos.fusion.bank.storage import PER_NODE, StateIndex, every_pair
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
@@ -186,7 +185,9 @@ class Report:
                 Parameter(time_s, node, None, "step_scale", grow, grow * sigma_scale),
                 Parameter(time_s, node, None, "heading_drift_rad_s", means[drift], sigma_drift),
             ]
-        parameters += self._pair_parameters() + self._common_parameters() + self._delays()
+        learned = self.core.hypotheses.biases.learned()
+        parameters += self._pair_parameters(learned) + self._common_parameters()
+        parameters += self._delays(learned)
         if self.detection.known:
             # One curve for the team; every node has it.
             curve = self.detection.range_m, self.detection.range_sigma_m
@@ -196,13 +197,12 @@ class Report:
             ]
         return tuple(parameters)
 
-    def _pair_parameters(self) -> list[Parameter]:
+    def _pair_parameters(self, learned: Learned) -> list[Parameter]:
         """Return the pairs' range biases, or differences of height where hypotheses have these."""
         named, parameters = {row: node for node, row in self.row.items()}, []
-        heights, learned = _pairs_learned(self.core.hypotheses)
-        for (a, b), (value, variance) in sorted(learned.items()):
+        for (a, b), (value, variance) in sorted(learned.pairs.items()):
             name, sigma = "range_bias_m", math.sqrt(max(variance, 0.0))
-            if heights:
+            if learned.heights:
                 # d(h^2) = 2 h dh; of next to nothing the square's own deviation is left.
                 name, square_m2 = "height_difference_m", max(value, 0.0)
                 value = math.sqrt(square_m2)
@@ -246,16 +246,12 @@ class Report:
             ]
         return parameters
 
-    def _delays(self) -> list[Parameter]:
-        """Return antenna delays (m), relative to the mean of all: what they share is a bias."""
-        delays = self.core.hypotheses.delays
-        entries = np.array(list(delays.values()), dtype=np.int64)
+    def _delays(self, learned: Learned) -> list[Parameter]:
+        """Return antenna delays (m)."""
         named = {row: node for node, row in self.row.items()}
-        sigmas = deviations_within(self.covariance, entries).tolist()
-        values = self.mean[entries] - self.mean[entries].mean() if delays else entries
         return [
-            Parameter(self.time_s, named[row], None, "antenna_delay_m", value, sigma)
-            for row, value, sigma in sorted(zip(delays, values.tolist(), sigmas, strict=True))
+            Parameter(self.time_s, named[row], None, "antenna_delay_m", *delay)
+            for row, delay in sorted(learned.delays.items())
         ]
 
     def _pairs(self) -> list[PairEstimate]:
@@ -276,7 +272,9 @@ class Report:
     def _range_scale_sd(self) -> float:
         """Return the deviation of what ranges' biases share in proportion to distance."""
         these = self.core.hypotheses
-        wide = these.models.has(RangeErrors.PASSING) if these.biases else these.models.has_biases
+        wide = these.models.has(RangeErrors.PASSING)
+        if not these.biases.pairs:
+            wide = wide + these.models.has(RangeErrors.CONSTANT)
         return RANGE_SCALE_SD * float(these.weights() @ wide)
 
     # -- the team while a node is ambiguous or sought ------------------------------------------
@@ -306,29 +304,6 @@ class Report:
         """List the modes of the team."""
         spread = team.place_covariances()
         return alternatives_of(self.time_s, team.nodes, team.weights, team.poses, spread)
-
-
-def _pairs_learned(
-    these: HypothesisSet,
-) -> tuple[bool, dict[tuple[int, int], tuple[float, float]]]:
-    """Return each pair of rows' own constant and its variance, and whether it is a height.
-
-    Squares of differences of height (m^2, m^4) where most hypotheses have these, else biases.
-    """
-    if not these.biases:
-        return False, {}
-    weight = these.weights()
-    has_heights = these.models.has(RangeErrors.HEIGHT)
-    heights = bool(weight @ has_heights > 0.5)
-    weight = weight * (has_heights == heights)
-    weight /= weight.sum()
-    entries = np.array(list(these.biases.values()), dtype=np.int64)
-    own = these.arrays.p[:, storage.triangle_place(entries, entries)]
-    means = storage.of_each(these.arrays.x[:, entries], these.count)
-    mean = weight @ means
-    variance = weight @ (storage.of_each(own, these.count) + (means - mean) ** 2)
-    learned = zip(mean.tolist(), variance.tolist(), strict=True)
-    return heights, dict(zip(these.biases, learned, strict=True))
 
 
 def _at_mode(node: NodeEstimate, team: PoseMixture) -> NodeEstimate:

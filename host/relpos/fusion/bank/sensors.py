@@ -72,8 +72,8 @@ def expect_outliers(counts: Floats, outlier: Floats) -> float:
 @inner
 def _innovations(
     ranges: Ranges, stats: Floats, before: Floats, perturbed: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return nu^2/S, nu/sqrt(S), max(nu^2 - S, 0) (m^2) of each range, of the mixture before it."""
+) -> tuple[Floats, Floats]:
+    """Return nu^2/S and max(nu^2 - S, 0) (m^2) of each range, of the mixture before it."""
     count, several = before.shape[0], ranges.first.shape[0]
     prior = np.empty(count)
     most, total = -np.inf, 0.0
@@ -84,7 +84,7 @@ def _innovations(
         total += prior[k]
     for k in range(count):
         prior[k] /= total
-    square, normal, excess = np.empty(several), np.empty(several), np.empty(several)
+    square, excess = np.empty(several), np.empty(several)
     for r in range(several):
         mean, variance = stats[r, MEAN], stats[r, VARIANCE]
         middle = 0.0
@@ -96,9 +96,8 @@ def _innovations(
             spread += prior[k] * (variance[k] + off * off)
         off = ranges.range_m[r] - middle
         square[r] = off * off / spread
-        normal[r] = math.copysign(math.sqrt(square[r]), off)
         excess[r] = max(off * off - spread, 0.0)
-    return square, normal, excess
+    return square, excess
 
 
 @compiled
@@ -113,20 +112,19 @@ def temper(log_weight: Floats, before: Floats) -> None:
 def learn(
     hypotheses: Hypotheses, ranges: Ranges, sensors: Sensors, draws: Draws, perturbed: Floats,
     stats: Floats, before: Floats, wary: bool,
-) -> tuple[tuple[Floats, Floats, Floats], int, int]:  # fmt: skip
+) -> tuple[tuple[Floats, Floats], int, int]:  # fmt: skip
     """Learn from the innovations of an instant's ranges (R,) what they say of the sensors.
 
     ``stats`` (R, STATS, >= K) are of the update, ``before`` (K,) the log weights before it. Then
     the evidence is tempered, and the variance components are drawn again. ``perturbed`` (K,)
     counts down the updates for which a hypothesis teaches nothing; ``wary`` lowers the threshold
-    of the fault detector. Returns each range's inlier probability, its excess if it is none, its
-    innovation over its deviation (R,), the row with an odometry fault or -1, and how many variance
-    components were clamped.
+    of the fault detector. Returns each range's inlier probability and its excess if it is none
+    (R,), the row with an odometry fault or -1, and how many variance components were clamped.
     """
     log_weight = hypotheses.log_weight
     count, several = before.shape[0], ranges.first.shape[0]
     first, second = ranges.first, ranges.second
-    square, innovation, excess = _innovations(ranges, stats, before, perturbed)
+    square, excess = _innovations(ranges, stats, before, perturbed)
     share = sensors.model.outlier[0]
     fault = update_cusum(sensors.cusum, first, second, square, ranges.sample_count, share, wary)
     weight = np.empty_like(log_weight)
@@ -158,4 +156,4 @@ def learn(
             surprise[row] += 0.2 * (1.0 - inlier[r] - surprise[row])
     temper(log_weight, before)
     components.spread(draws, sensors.mean, sensors.covariance, hypotheses)
-    return (inlier, off_m, innovation), fault, clamped
+    return (inlier, off_m), fault, clamped

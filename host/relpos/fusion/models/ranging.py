@@ -264,9 +264,9 @@ LASTING_FROM, LASTING_COST = 0.02, 30.0
 """Share of the innovations' variance that errors have which last and are not modelled, above which
 ranges count less, and by how much: 1 / (1 + cost * excess).
 
-Without heights on two floors the share is 0.03 to 0.5, elsewhere at most 0.02 (14 to 24 people).
-Chosen on seeds 11 and 12, NEES of 14, 20 and 24 people there with costs of 20, 40 and 80: 1.3, 0.9
-and 0.6; seeds 30 to 32 with and without it: ``docs/notebook/large-teams.md``."""
+For large teams: without heights on two floors the share is 0.08 to 0.5, elsewhere at most 0.02 (24
+people). Chosen on seeds 11 and 12, NEES there with costs of 20, 40 and 80: 1.3, 0.9 and 0.6; seeds
+30 to 32 with and without it: ``docs/notebook/large-teams.md``. The bank learns heights instead."""
 
 LASTING_MEAN, LASTING_RANGES, LASTING_MOST = 20.0, 1000.0, 3.0
 """A pair's mean is over so many ranges, the team's share over so many, and innovations count up to
@@ -277,9 +277,9 @@ so many standard deviations."""
 class RangeCorrelation:
     """What ranges repeat: by the pair's path since its last one, and as far as errors last.
 
-    Where pairs have no biases of their own (teams of more than six), what lasts, such as the
-    slant between floors of unknown height, shows in innovations: the product of a range's with
-    the mean of its pair's earlier ones is the variance of what lasts, in the mean over the team.
+    Where heights are not modelled (large teams), what lasts, such as the slant between floors,
+    shows in innovations: the product of a range's with the mean of its pair's earlier ones is the
+    variance of what lasts, in the mean over the team.
     """
 
     _path_m: dict[int, float] = field(default_factory=dict)
