@@ -73,9 +73,9 @@ class RangeErrors(IntEnum):
     """As constant, but of each pair the square of its difference of height in place of the bias.
 
     Of more than ``PAIR_BIASES`` users, each one's height in place of the antenna's delay. Where
-    nobody's height is known; a range's square is linear in that of a pair. ``mission-floors-no-heights``,
-    seeds 640 to 642: 0.30 m, NEES 3.2 without, 0.13 m, 0.9 so; ``paper``, 23010 to 23019:
-    0.794 +- 0.029 m, 0.798 +- 0.022.
+    nobody's height is known; a range's square is linear in that of a pair.
+    ``mission-floors-no-heights``, seeds 640 to 642: 0.30 m, NEES 3.2 without, 0.13 m, 0.9 so;
+    ``paper``, 23010 to 23019: 0.794 +- 0.029 m, 0.798 +- 0.022.
     """
     PASSING = 3
     """As constant, but a pair's bias passes as its users walk: walls come and go."""
