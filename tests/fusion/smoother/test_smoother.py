@@ -432,6 +432,15 @@ def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition:
     assert 0.5 < scores[1].nees_distance < 2.5
 
 
+@pytest.mark.parametrize("nodes", [5, pytest.param(8, marks=pytest.mark.soak)])
+def test_smoothing_takes_heights_that_nobody_reports_as_they_were_learned(nodes: int) -> None:
+    run = relpos.simulate("mission-floors-no-heights", 4060, seconds=150.0, nodes=nodes)
+    smoothed = relpos.fuse(run, smooth=True)
+    score = relpos.evaluate(smoothed, run, bound=False).metrics
+    assert score.relative_distance_rmse_m < 0.12
+    assert 0.5 < score.nees_distance < 1.5
+
+
 def test_inlier_probabilities_are_those_of_all_sequences_of_states() -> None:
     density = np.random.default_rng(4).uniform(0.1, 3.0, (5, 3))
     chain, share, go_on = np.array([0, 0, 0, 2, 2]), 0.2, 0.7

@@ -1,14 +1,15 @@
 """Measurements without the errors that the online estimator has learned of them.
 
 At the end of a run it knows by how much ranges are dated late, how far each clock is ahead, and
-what a body adds to a range. Smoothing begins from measurements without these.
+what a body adds to a range. Smoothing begins from measurements without these. Where nobody reports
+a height it knows how far one is over the other, which makes their ranges slant.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,39 @@ Floats = npt.NDArray[np.float64]
 
 SURE = 3.0
 """What is smaller than so many of its standard deviations is left in."""
+
+
+LEARNED_AFTER_S = 20.0
+"""So much later it is looked up how high people were: first it has to be learned.
+
+NEES of the smoother in ``mission-floors-no-heights``, 150 s, seeds 4050 to 4052: 2.7 of six people
+without heights, 1.7, 1.3, 1.0, 0.9, 0.9 after 0, 10, 20, 30, 60 s; of eight of whom a third takes
+the stairs 5.8 without, then 2.4, 1.8, 1.8, 2.2, 4.0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rises:
+    """How far one node was over another (m), as far as that was learned from ranges alone."""
+
+    by_pair: Mapping[tuple[int, int], tuple[Floats, Floats]]
+    """Pair, the lower node first -> times (s) and differences (m)."""
+
+    def rise_m(self, node: int, peer: int, time_s: float) -> float:
+        """Return the difference of a pair; 0 where none is known."""
+        known = self.by_pair.get((min(node, peer), max(node, peer)))
+        return float(np.interp(time_s + LEARNED_AFTER_S, *known)) if known else 0.0
+
+
+def learned_rises(estimates: Sequence[Estimate]) -> Rises:
+    """Return the differences of height that estimates tell, 0 where they are not sure of any."""
+    rows: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    for e in estimates:
+        for p in e.parameters:
+            if p.name == "height_difference_m" and p.peer is not None:
+                value = p.value if p.value > SURE * p.sigma else 0.0
+                rows.setdefault((p.node, p.peer), []).append((e.time_s, value))
+    by_pair = {pair: np.array(row).T for pair, row in rows.items()}
+    return Rises({pair: (row[0], row[1]) for pair, row in by_pair.items()})
 
 
 def as_learned(

@@ -31,7 +31,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.models.ranging import RANGE_SCALE_SD, Mounting
 from relpos.fusion.models.unseen_walk import TURNS_RAD2_S, WALKING_M_S
 from relpos.fusion.post import posts_of
-from relpos.fusion.smoother.as_learned import as_learned, range_scale_sd
+from relpos.fusion.smoother.as_learned import as_learned, learned_rises, range_scale_sd
 from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.lasting import without_lasting_errors
 from relpos.fusion.smoother.problem import Problem
@@ -98,7 +98,8 @@ class Smoother:
         nodes = [prior.node for prior in self.priors]
         learned = as_learned(self._measurements, self._estimates)
         climbed = as_climbed(learned, nodes, posts_of(self.mountings))
-        graph, unused = build_graph(climbed, self.priors, self.mountings)
+        rises = learned_rises(self._estimates)
+        graph, unused = build_graph(climbed, self.priors, self.mountings, rises)
         self._own.update(unused)
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)

@@ -20,6 +20,7 @@ from relpos.errors import RelposError
 from relpos.fusion.models.detection import Round, Rounds, on_one_floor
 from relpos.fusion.models.motion import unseen_variance
 from relpos.fusion.models.ranging import Mounting, antenna_m, tag_height_m
+from relpos.fusion.smoother.as_learned import Rises
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior
 
@@ -169,6 +170,7 @@ class _Builder:
     """Runs the steps of a timeline into lists."""
 
     mountings: Mapping[int, Mounting]
+    rises: Rises
     partial: dict[int, list[float]] = field(default_factory=dict)
     """Of the open chord: x, y, turn in the frame of its beginning, variances of both, the
     longest duration (s) of a report in it, the sum of the shares of reports, and that of their
@@ -224,7 +226,8 @@ class _Builder:
         places: list[float] = []
         for one in (node, peer):
             places += self.partial.get(one, [0.0, 0.0])[:2]
-        dz_m = self._height(node) - self._height(peer)
+        reported_m = self._height(node) - self._height(peer)
+        dz_m = math.hypot(reported_m, self.rises.rise_m(node, peer, time_s))
         return _Entry(len(self.times), time_s, node, peer, range_m, dz_m, tuple(places))
 
     def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
@@ -239,13 +242,15 @@ def build_graph(
     measurements: Iterable[Measurement],
     priors: Sequence[Prior] = (),
     mountings: Mapping[int, Mounting] | None = None,
+    rises: Rises | None = None,
 ) -> tuple[Graph, Counter[str]]:
     """Put a run's measurements in order, and count what smoothing does not use.
 
+    ``rises`` are differences of height beside what is measured.
     Raises RelposError where there is no motion at all.
     """
     timeline = Timeline([p.node for p in priors], max_lag_s=math.inf)
-    builder = _Builder(mountings or {})
+    builder = _Builder(mountings or {}, rises or Rises({}))
     for measurement in measurements:
         for step in timeline.push(measurement):
             builder.add(step, timeline.reported_s)
