@@ -1,8 +1,8 @@
 """How the estimators do on missions that nobody planned, condition by condition.
 
     python bench/missions.py [--seeds 3] [--first 0] [--only TEXT] [--estimators bank,ekf]
-                             [--set KEY=VALUE] [--workers N] [--seconds S] [--regrouping]
-                             [--mixed]
+                             [--set KEY=VALUE] [--workers N] [--seconds S] [--nodes N]
+                             [--regrouping] [--mixed]
 
 prints, for each condition of ``relpos.simulation.missions`` and each estimator: distance, aligned
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
@@ -11,6 +11,7 @@ triangles of ok pairs the share that is told mirrored (%); the worst
 seed's distance RMSE; processor seconds of a run; and the body-frame RMSE over that of ``ekf``,
 where that runs, too. ``ekf`` is :class:`PlainEkf`, and ``exact`` :class:`ExactFilter`, for teams of
 two: what is possible. ``smoother`` begins from the bank, which is ``large teams`` from 21 nodes on.
+``--nodes`` gives every condition a team of that size.
 
 ``--mixed`` prints instead a line for each seed, whose team, sensors and conditions are all drawn
 (:func:`mixed`): how they do together, where nobody chose what meets what.
@@ -32,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos import fusion, tracks
+from relpos.errors import RelposError
 from relpos.evaluation import metrics, study
 from relpos.evaluation.executors import executor
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
@@ -205,14 +207,13 @@ class PlainEkf(Rewinder):
 
 
 def case(
-    condition: str, estimator: str, settings: dict[str, str], seconds: float | None = None
+    condition: str, estimator: str, settings: dict[str, str], **overrides: float
 ) -> study.Case:
-    """Make one line of the table; ``seconds`` are the missions' own where None."""
+    """Make one line of the table; ``overrides`` are settings of the mission."""
     name = TOLD.get(estimator, "bank" if estimator == "smoother" else estimator)
     given = {} if estimator in TOLD else settings
     label = f"{condition:18}{estimator:9}"
     scenario = f"{missions.PREFIX}-{condition}"
-    overrides = {} if seconds is None else {"seconds": seconds}
     return study.Case(label, scenario, overrides, name, given, smooth=estimator == "smoother")
 
 
@@ -265,8 +266,8 @@ def print_mixed(
     kept = 0
     for seed in seeds:
         drawn = mixed(seed)
-        one = case("base", estimator, settings, seconds)
-        one = replace(one, label=f"{seed:<18}{estimator:9}", overrides={**one.overrides, **drawn})
+        one = case("base", estimator, settings, seconds=seconds, **drawn)
+        one = replace(one, label=f"{seed:<18}{estimator:9}")
         made = study.run([one], range(seed, seed + 1), pool)[0]
         said = " ".join(f"{k}={v:g}" for k, v in drawn.items() if v != BASE[k])
         print(f"{row_of(made, None)}  {said}", flush=True)
@@ -338,11 +339,21 @@ def main() -> None:
     parser.add_argument("--estimators", default="bank,ekf")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seconds", type=float, default=None, help="length of each mission")
+    parser.add_argument("--nodes", type=int, default=None, help="how many people, in each")
     parser.add_argument("--workers", type=int, default=None)
     parser.add_argument("--regrouping", action="store_true", help="when splits are right again")
     parser.add_argument("--mixed", action="store_true", help="all conditions drawn, seed by seed")
     given = parser.parse_args()
-    settings = dict(pair.split("=", 1) for pair in given.set)
+    settings = dict(pair.partition("=")[::2] for pair in given.set)
+    given_alike = {"seconds": given.seconds, "nodes": given.nodes}
+    overrides = {name: value for name, value in given_alike.items() if value is not None}
+    conditions = [
+        c for c in missions.CONDITIONS if any(text in c for text in given.only.split(","))
+    ]
+    if not conditions:
+        raise RelposError(
+            f"no condition's name has '{given.only}': {', '.join(missions.CONDITIONS)}"
+        )
     seeds = range(given.first, given.first + given.seeds)
     with executor(workers=given.workers) as pool:
         if given.regrouping:
@@ -357,12 +368,10 @@ def main() -> None:
             for name in given.estimators.split(","):
                 print_mixed(seeds, name, settings, given.seconds or 300.0, pool)
             return
-        for condition in missions.CONDITIONS:
-            if not any(text in condition for text in given.only.split(",")):
-                continue
+        for condition in conditions:
             names = given.estimators.split(",")
             made = {
-                n: study.run([case(condition, n, settings, given.seconds)], seeds, pool)[0]
+                n: study.run([case(condition, n, settings, **overrides)], seeds, pool)[0]
                 for n in names
             }
             for outcome in made.values():
@@ -370,4 +379,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except RelposError as error:
+        raise SystemExit(f"missions: {error}") from None
