@@ -166,3 +166,12 @@ def test_a_range_between_unknown_heights_corrects_as_a_million_samples_do() -> N
     assert after_x[k, of] - x[k, of] == pytest.approx(0.5 * gain, rel=0.05)
     shrunk = both[:-1, :-1] - np.outer(gain, both[:-1, -1])
     assert after_p[k][np.ix_(of, of)] == pytest.approx(shrunk, abs=4e-3)
+
+
+def test_a_crowd_side_by_side_is_not_taken_for_a_steep_one() -> None:
+    run = relpos.simulate("mission-two-abreast", 4400, nodes=10, seconds=100)
+    metrics = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
+    # 1.6 m and NEES 9 where heights are believed though no distance changes.
+    assert metrics.relative_distance_rmse_m < 0.5
+    assert metrics.nees_distance < 1.5
+    assert metrics.ok_over_3_sigma < 0.015

@@ -169,6 +169,7 @@ class BankCore:
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
         counts, kept = repeats or Repeats(np.ones(several), np.zeros(several))
         self._check(first, second, range_m, dz_m, variance, counts)
+        these.biases.watch(first, second, range_m)
         biases = these.biases.entries(first, second)
         velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
         outlier, known = self._sensors.model.outlier, self._sensors
