@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -175,3 +176,30 @@ def test_a_crowd_side_by_side_is_not_taken_for_a_steep_one() -> None:
     assert metrics.relative_distance_rmse_m < 0.5
     assert metrics.nees_distance < 1.5
     assert metrics.ok_over_3_sigma < 0.015
+
+
+def test_hypotheses_agree_on_who_is_above_before_they_are_merged_and_go_on_alike() -> None:
+    core = BankCore(BankSettings(hypotheses=16, wrong_starts=0.0, biased=1.0, constants=0.0), 7)
+    for n in range(7):
+        core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
+    first, second = np.triu_indices(7, 1)
+    range_m = np.hypot(3.0 * (second - first), 4.0 * (second**2 - first**2))
+    core.update(first, second, range_m + 0.1, np.zeros(len(range_m)))
+    plain = deepcopy(core)
+    these = core.hypotheses
+    own = these.models.range_errors == RangeErrors.HEIGHT
+
+    def heights() -> np.ndarray:
+        above = these.dense()[0][own][:, list(these.biases.users.values())]
+        return above - above.mean(axis=1, keepdims=True)
+
+    best = these.weights()[own].argmax()
+    assert (heights() @ heights()[best] < 0.0).any()
+    these.biases.mirror_heights()
+    assert (heights() @ heights()[best] > 0.0).all()
+    for one in (core, plain):
+        one.update(first, second, range_m - 0.1, np.zeros(len(range_m)))
+    (x, p), (plain_x, plain_p) = these.dense(), plain.hypotheses.dense()
+    poses = slice(0, PER_NODE * 7)
+    assert x[:, poses] == pytest.approx(plain_x[:, poses])
+    assert p[:, poses, poses] == pytest.approx(plain_p[:, poses, poses])

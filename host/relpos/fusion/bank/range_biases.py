@@ -48,7 +48,6 @@ A third of 8 and 12 people go up one storey, 240 s, seeds 4030 to 4033: .19 and 
 and .13 so; .14 and .11 with 0.1 m, by which 8 who stay on their storeys have .14 m in place of .12.
 Squares of pairs do not grow: two robots (``exp4_los``) would be .24 m off in place of .17."""
 
-
 VARIED, VARIED_AFTER, VARIED_RANGES = 0.05, 8, 200
 """Standard deviation of a pair's distance over its mean from which on it tells heights, after so
 many ranges, over at most so many.
@@ -80,7 +79,7 @@ class RangeBiases:
         self.pairs: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its bias in the state."""
         self.users: dict[int, int] = {}
-        """Row -> entry of its antenna delay, by which each of its ranges is too long (m)."""
+        """Row -> entry of its antenna delay, by which each of its ranges is too long, or height."""
         self.heights_known = False
         self._climbed_s: float | None = None
         self._ranges: dict[tuple[int, int], tuple[int, float, float]] = {}
@@ -316,8 +315,9 @@ class RangeBiases:
         these, own = self._hypotheses, np.array(list(self.users.values()), dtype=np.int64)
         heights = storage.of_each(these.arrays.x[:, own], these.count)
         off = heights - heights.mean(axis=1, keepdims=True)
-        mirrored = off @ off[these.log_weight.argmax()] < 0.0
-        which = np.flatnonzero(mirrored & (these.models.has(RangeErrors.HEIGHT) > 0.0))
+        has_heights = these.models.has(RangeErrors.HEIGHT)
+        likeliest = (these.weights() * has_heights).argmax()
+        which = np.flatnonzero(has_heights * (off @ off[likeliest]) < 0.0)
         others = np.setdiff1d(np.arange(these.arrays.x.shape[1]), own)
         block, lane = these.at(which)
         these.arrays.x[block[:, None], own, lane[:, None]] *= -1.0
