@@ -345,8 +345,10 @@ def main() -> None:
     parser.add_argument("--mixed", action="store_true", help="all conditions drawn, seed by seed")
     given = parser.parse_args()
     settings = dict(pair.partition("=")[::2] for pair in given.set)
-    given_alike = {"seconds": given.seconds, "nodes": given.nodes}
-    overrides = {name: value for name, value in given_alike.items() if value is not None}
+    if given.nodes is not None and (given.mixed or given.regrouping):
+        parser.error("--nodes is for the table of conditions alone")
+    in_each = {"seconds": given.seconds, "nodes": given.nodes}
+    overrides = {name: value for name, value in in_each.items() if value is not None}
     conditions = [
         c for c in missions.CONDITIONS if any(text in c for text in given.only.split(","))
     ]

@@ -121,7 +121,11 @@ class HypothesisArrays:
 
     def poses_of(self, *rows: int) -> tuple[Floats, Floats]:
         """Poses (K, 3 M) of users and their covariances (K, 3 M, 3 M)."""
-        places = (storage.POSE * np.array(rows)[:, None] + np.arange(storage.POSE)).ravel()
+        places = storage.POSE * np.array(rows)[:, None] + np.arange(storage.POSE)
+        return self.entries_of(places.ravel())
+
+    def entries_of(self, places: Indices) -> tuple[Floats, Floats]:
+        """Return means (K, E) and covariances (K, E, E) of stored entries (E,)."""
         pairs = storage.triangle_place(places[:, None], places)
         return (
             storage.of_each(self.arrays.x[:, places], self.count),

@@ -105,6 +105,8 @@ class RangeBiases:
 
     def watch(self, first: Indices, second: Indices, range_m: Floats) -> None:
         """Note the ranges (R,) of users, whose heights they tell where distances change."""
+        if self._hypotheses.nodes <= PAIR_BIASES or self.heights_known:
+            return
         ranges = zip(first.tolist(), second.tolist(), range_m.tolist(), strict=True)
         for a, b, measured_m in ranges:
             pair = (a, b) if a < b else (b, a)
@@ -266,37 +268,25 @@ class RangeBiases:
         pairs = self._of_pairs(weight)
         if not self.users:
             return Learned(heights, pairs, {})
-        users = np.array(list(self.users))
-        means, spreads = self._moments(np.array(list(self.users.values()), dtype=np.int64))
+        users, entries = np.array(list(self.users)), np.array(list(self.users.values()))
+        means, spreads = these.entries_of(entries)
         if heights:
             return Learned(heights, pairs | _squares_apart(users, weight, means, spreads), {})
-        off = means - weight @ means
+        mean = weight @ means
+        off = means - mean
         covariance = np.einsum("k,kij->ij", weight, spreads) + (off.T * weight) @ off
         sigmas = deviations_within(covariance, np.arange(len(users))).tolist()
-        mean = weight @ means
-        values = (mean - mean.mean()).tolist()
-        known = zip(values, sigmas, strict=True)
+        known = zip((mean - mean.mean()).tolist(), sigmas, strict=True)
         return Learned(heights, pairs, dict(zip(self.users, known, strict=True)))
 
     def _of_pairs(self, weight: Floats) -> dict[tuple[int, int], tuple[float, float]]:
         if not self.pairs:
             return {}
-        these, entries = self._hypotheses, np.array(list(self.pairs.values()), dtype=np.int64)
-        own = these.arrays.p[:, storage.triangle_place(entries, entries)]
-        means = storage.of_each(these.arrays.x[:, entries], these.count)
+        means, spreads = self._hypotheses.entries_of(np.array(list(self.pairs.values())))
         mean = weight @ means
-        variance = weight @ (storage.of_each(own, these.count) + (means - mean) ** 2)
+        variance = weight @ (spreads.diagonal(axis1=1, axis2=2) + (means - mean) ** 2)
         known = zip(mean.tolist(), variance.tolist(), strict=True)
         return dict(zip(self.pairs, known, strict=True))
-
-    def _moments(self, entries: Indices) -> tuple[Floats, Floats]:
-        """Return means (K, E) and covariances (K, E, E) of entries."""
-        these = self._hypotheses
-        spreads = these.arrays.p[:, storage.triangle_place(entries[:, None], entries)]
-        return (
-            storage.of_each(these.arrays.x[:, entries], these.count),
-            storage.of_each(spreads, these.count),
-        )
 
     # -- unknown heights -----------------------------------------------------------------------
 
@@ -304,11 +294,10 @@ class RangeBiases:
         """Make users' unknown heights less certain: people may have climbed since the last time."""
         passed_s = 0.0 if self._climbed_s is None else max(time_s - self._climbed_s, 0.0)
         self._climbed_s = time_s
-        arrays = self._hypotheses.arrays
-        for entry in self.users.values():
-            arrays.p[:, storage.triangle_place(entry, entry)] += (
-                CLIMB_M2_S * passed_s * arrays.has_heights
-            )
+        arrays, own = self._hypotheses.arrays, np.array(list(self.users.values()), dtype=np.int64)
+        grown = CLIMB_M2_S * passed_s * arrays.has_heights
+        if grown.any():
+            arrays.p[:, storage.triangle_place(own, own)] += grown[:, None]
 
     def mirror_heights(self) -> None:
         """Put the same users on top in all hypotheses: no range tells up from down."""
@@ -332,7 +321,7 @@ def _squares_apart(
 
     ``weight`` (K,), ``means`` (K, N) and ``spreads`` (K, N, N) are those of the heights.
     """
-    i, j = np.triu_indices(len(users), 1)
+    i, j = storage.every_pair(len(users))
     apart2 = (means[:, i] - means[:, j]) ** 2
     own = spreads.diagonal(axis1=1, axis2=2)
     variance = np.maximum(own[:, i] + own[:, j] - 2.0 * spreads[:, i, j], 0.0)

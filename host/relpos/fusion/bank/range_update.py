@@ -81,8 +81,8 @@ class Ranges(NamedTuple):
     kept: Floats
     """What is left of a passing bias since the pair's last range."""
     bias: Indices
-    """(R, 3): entries of the state that hold the range's bias and both users' antenna delays; -1
-    where there is none."""
+    """(R, 3): entries of the state that hold the range's bias and both users' antenna delays, or
+    heights; -1 where there is none."""
     velocity_m_s: Floats
     """(R, 4): of the first, forward and left, and of the second; no motion is 0."""
     outliers: Floats
