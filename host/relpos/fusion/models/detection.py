@@ -271,6 +271,8 @@ _NEAR = np.array([0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 0.995
 _EDGE_M = np.geomspace(2.0, 80.0, 90)
 _SOFTNESS = np.array([0.005, 0.03, 0.08, 0.2, 0.5])
 
+FADES_WITHIN_M = 25.0
+
 _GRID_M = np.arange(LENGTH) * STEP_M
 _OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
 _SHARES = np.array([[1.0], [4.0], [1.0]]) / 6.0
@@ -290,6 +292,8 @@ class _Family:
     log_received: npt.NDArray[np.float32]
     """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
     edge_m: Floats
+    fades: npt.NDArray[np.bool_]
+    """(F,) the softest."""
 
 
 @cache
@@ -307,6 +311,7 @@ def _family() -> _Family:
         np.ascontiguousarray(np.log1p(-curves).T.astype(single)),
         np.ascontiguousarray(np.log(curves).T.astype(single)),
         edge.ravel(),
+        (soft.ravel() == _SOFTNESS[-1]) & (edge.ravel() < FADES_WITHIN_M),
     )
 
 
@@ -316,12 +321,15 @@ class Detection:
 
     ``curve`` (LENGTH,) is P(received | distance) at multiples of ``STEP_M`` for a pair that was
     attempted. ``range_m`` and ``range_sigma_m`` are the distance of half the near value.
+    ``obstructed`` (0 to 1) is by how much more probable than at first it is that detection fades
+    with distance, as through walls, and has no edge.
     """
 
     rounds: Rounds = field(default_factory=Rounds)
     curve: Floats = field(init=False)
     range_m: float = field(init=False)
     range_sigma_m: float = field(init=False)
+    obstructed: float = field(init=False)
     _statistics: Statistics = field(
         default_factory=lambda: Statistics(
             np.ones(0), np.empty((0, 0)), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0])
@@ -405,6 +413,8 @@ class Detection:
         self.curve = (posterior.astype(np.float32) @ family.curves[likely]).astype(np.float64)
         edge_m = family.edge_m[likely]
         self.range_m = float(posterior @ edge_m)
+        fades, at_first = float(posterior @ family.fades[likely]), float(family.fades.mean())
+        self.obstructed = max(fades - at_first, 0.0) / (1.0 - at_first)
         spread = float(posterior @ (edge_m - self.range_m) ** 2)
         self.range_sigma_m = math.sqrt(spread + (SHAPE * self.range_m) ** 2 + STEP_M**2 / 12.0)
         # Later evidence changes little: the cost of refitting stays a small share of the whole.

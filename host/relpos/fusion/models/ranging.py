@@ -141,6 +141,9 @@ without it, 1.7 so, 1.4 with .02, and with walls 8, 6 and 4 % beyond three sigma
 in sight 1.1, 1.0 and .84; ``mission-shadow``, seed 640, .88, .73 and .52, where .7 is the least
 that is wanted (docs/notebook/missions.md)."""
 
+WALLS_SCALE_SD = 0.03
+"""The same where detection fades with distance (``Detection.obstructed``)."""
+
 
 def growth_slope(distance_m: float) -> float:
     """Return a range's slope in the growth; ``fusion/bank/range_update.py`` has it of lanes."""
