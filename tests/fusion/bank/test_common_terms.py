@@ -192,20 +192,38 @@ def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     conditions = {"nodes": 5, "area_m": 30, "walls": 1, "max_range_m": 30, "range_rate_hz": 2.0}
-    runs = [
-        relpos.simulate("mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions)
+    runs = {
+        str(seed): relpos.simulate(
+            "mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions
+        )
         for seed in (701, 704, 705, 707)
-    ]
+    }
 
-    def too_sure() -> float:
-        scores = [relpos.evaluate(relpos.fuse(run), run, bound=False).metrics for run in runs]
+    def too_sure(of: dict[str, relpos.Result]) -> float:
+        scores = [relpos.evaluate(of[name], runs[name], bound=False).metrics for name in runs]
         return float(np.mean([score.ok_over_3_sigma for score in scores]))
 
-    so = too_sure()
-    assert so < 0.06
-    monkeypatch.setattr(reporting, "RANGE_SCALE_SD", 0.0)
-    # 0.016 and 0.048.
-    assert so < 0.5 * too_sure()
+    def without_scale(of: relpos.Result) -> relpos.Result:
+        """Take out of the distances' sigmas what is told of the ranges' scale."""
+        told = []
+        for e in of.estimates:
+            (sd,) = {p.sigma for p in e.parameters if p.name == "range_scale"} or {0.0}
+            pairs = [
+                dataclasses.replace(p, sigma_distance_m=math.sqrt(own_m2))
+                for p in e.pairs
+                for own_m2 in [p.sigma_distance_m**2 - (sd * p.distance_m) ** 2]
+            ]
+            told.append(dataclasses.replace(e, pairs=tuple(pairs)))
+        return dataclasses.replace(of, estimates=tuple(told))
+
+    so = too_sure({name: relpos.fuse(run) for name, run in runs.items()})
+    assert so < 0.015
+    monkeypatch.setattr(reporting, "WALLS_SCALE_SD", 0.0)
+    biases_alone = {name: relpos.fuse(run) for name, run in runs.items()}
+    # 0.004, 0.016 and 0.048.
+    assert so < 0.5 * too_sure(biases_alone)
+    without = {name: without_scale(result) for name, result in biases_alone.items()}
+    assert too_sure(biases_alone) < 0.5 * too_sure(without)
 
 
 @pytest.mark.parametrize("seed", [602, pytest.param(603, marks=pytest.mark.soak)])

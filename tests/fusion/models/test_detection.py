@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from itertools import groupby, permutations
+from itertools import combinations, groupby, permutations
 
 import numpy as np
 import pytest
@@ -72,6 +72,40 @@ def test_before_anything_is_learned_a_miss_says_little() -> None:
     near, far = np.log1p(-learner.probability(np.array([2.0, 30.0])))
     assert 0.0 < far - near < 1.0
     assert not learner.known
+
+
+def outcomes(law: Callable[[float], float], rounds: int) -> Detection:
+    """What is learned from four nodes at random places, whose attempts succeed by a law."""
+    rng = np.random.default_rng(8)
+    learner, pairs = Detection(), list(combinations(range(4), 2))
+    for k in range(rounds):
+        place = rng.uniform(0.0, 25.0, (4, 2))
+        distance = {p: float(np.hypot(*(place[p[0]] - place[p[1]]))) for p in pairs}
+        got = [p for p in pairs if rng.random() < law(distance[p])]
+        missed = [p for p in pairs if p not in got]
+        of = np.array([distance[p] for p in (*got, *missed)])
+        one = Round(float(k), tuple(got), tuple(missed), (True,) * len(got))
+        learner.update(one, of, np.full(len(pairs), 0.2))
+    return learner
+
+
+@pytest.mark.parametrize(
+    ("law", "obstructed"),
+    [
+        # Half are lost for each wall, of which there is one every eight metres.
+        (lambda distance_m: 0.9 * 0.5 ** (distance_m / 8.0), True),
+        (lambda distance_m: 0.4 * 0.5 ** (distance_m / 8.0), True),
+        (lambda _: 0.9, False),
+        (lambda _: 0.4, False),
+        (lambda distance_m: 0.7 * (distance_m < 15.0), False),
+    ],
+)
+def test_ranges_that_fade_with_distance_are_told_from_ranges_lost_at_random_and_from_an_edge(
+    law: Callable[[float], float], obstructed: bool
+) -> None:
+    assert Detection().obstructed == 0.0
+    learned = outcomes(law, 400).obstructed
+    assert learned > 0.8 if obstructed else learned < 0.05
 
 
 def instants(

@@ -272,6 +272,9 @@ _EDGE_M = np.geomspace(2.0, 80.0, 90)
 _SOFTNESS = np.array([0.005, 0.03, 0.08, 0.2, 0.5])
 
 FADES_WITHIN_M = 25.0
+"""The softest curves whose half is nearer are those of walls. Of mixed missions with walls people
+have 9 to 25 m. In the open a curve is as soft for the first minutes, but its half is far out: with
+all of the softest ``mission-base`` has a NEES of .64 in place of .81, ``floors`` .47 of .73."""
 
 _GRID_M = np.arange(LENGTH) * STEP_M
 _OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
