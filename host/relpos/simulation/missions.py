@@ -92,6 +92,7 @@ CONDITIONS: Mapping[str, Mapping[str, float]] = {
     "crawl": {"scale_change": 0.74},
     "nlos": {"nlos_share": 0.4},
     "walls": {"walls": 1, "max_range_m": 8},
+    "office": {"walls": 1},
     "rare": {"range_rate_hz": 0.1},
     "dense": {"range_rate_hz": 10},
     "shadow": {"shadow_m": 0.8},

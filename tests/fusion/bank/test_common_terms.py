@@ -11,13 +11,13 @@ import pytest
 import relpos
 from reference import joint as reference
 from relpos import fusion, tracks
-from relpos.fusion.bank import reporting
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import LEAST_SHARE, LEAST_WEIGHT, RangeErrors
 from relpos.fusion.bank.storage import COMMON, PER_NODE, StateIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks, time_offsets
 from relpos.fusion.estimator import Estimate, Parameter
 from relpos.fusion.estimator_settings import BankSettings
+from relpos.fusion.models import detection
 from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, CommonIndex, Repeats
 from relpos.measurements import Measurement, Motion, Range
 from relpos.simulation.paper import simulate_paper
@@ -218,7 +218,7 @@ def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges(
 
     so = too_sure({name: relpos.fuse(run) for name, run in runs.items()})
     assert so < 0.015
-    monkeypatch.setattr(reporting, "WALLS_SCALE_SD", 0.0)
+    monkeypatch.setattr(detection, "WALLS_SCALE_SD", 0.0)
     biases_alone = {name: relpos.fuse(run) for name, run in runs.items()}
     # 0.004, 0.016 and 0.048.
     assert so < 0.5 * too_sure(biases_alone)

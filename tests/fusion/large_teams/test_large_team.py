@@ -335,6 +335,17 @@ def test_a_large_team_on_two_floors_without_heights_is_no_surer_than_right() -> 
     assert 0.4 < scored.nees_distance < 2.0
 
 
+def test_a_large_team_in_an_office_is_no_surer_than_right() -> None:
+    """Not knowing walls by the ranges that they take: NEES 4.2, 14 % beyond three sigmas."""
+    run = relpos.simulate("mission-office", 3, nodes=LARGE_TEAM + 1, seconds=70.0)
+    result = relpos.fuse(run)
+    scored = relpos.evaluate(result, run, bound=False).metrics
+    assert 0.4 < scored.nees_distance < 1.4
+    assert scored.ok_over_3_sigma < 0.015
+    told = [p.sigma for p in result.estimates[-1].parameters if p.name == "range_scale"]
+    assert min(told) > 0.02
+
+
 @pytest.mark.parametrize("size", [3, LARGE_TEAM + 2])
 @pytest.mark.parametrize("climbs", [False, True], ids=["level", "with heights"])
 def test_a_tag_is_as_high_as_it_is_worn_and_its_wearer_has_climbed(size: int, climbs: bool) -> None:

@@ -37,12 +37,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.ranging import (
-    RANGE_SCALE_SD,
-    WALLS_SCALE_SD,
-    CommonIndex,
-    deviations_within,
-)
+from relpos.fusion.models.ranging import RANGE_SCALE_SD, CommonIndex, deviations_within
 from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
@@ -280,8 +275,8 @@ class Report:
         wide = these.models.has(RangeErrors.PASSING)
         if not these.biases.pairs:
             wide = wide + these.models.has(RangeErrors.CONSTANT)
-        walls = WALLS_SCALE_SD * math.sqrt(self.detection.obstructed)
-        return math.hypot(RANGE_SCALE_SD * float(these.weights() @ wide), walls)
+        lasting = RANGE_SCALE_SD * float(these.weights() @ wide)
+        return math.hypot(lasting, self.detection.range_scale_sd)
 
     # -- the team while a node is ambiguous or sought ------------------------------------------
 

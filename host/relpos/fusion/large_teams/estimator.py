@@ -41,6 +41,7 @@ from relpos.fusion.large_teams.sparse_filter import (
     prior_information,
 )
 from relpos.fusion.large_teams.variance_components import VarianceComponents
+from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.motion import WALK_M_S, reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
@@ -82,7 +83,7 @@ ONE_STRIP = 50
 
 Up to so many have antenna delays and clocks of their own, too: T terms make as many right-hand
 sides, each of 2 N numbers. A team that outgrows them has what all ranges have in common, and no
-more."""
+more. Detection is learned of so many: pairs grow with the square."""
 
 REACH_SLACK = 1.05
 """Strips are this much wider than the longest range of the first instant."""
@@ -142,6 +143,7 @@ class LargeTeam:
     _outlying: Floats = field(default_factory=lambda: np.empty(0))
     """Fraction of outliers in each node's latest ranges."""
     _components: VarianceComponents = field(default_factory=VarianceComponents)
+    _detection: Detection = field(default_factory=Detection)
     _outliers: OutlierPersistence = field(default_factory=OutlierPersistence)
     _correlation: RangeCorrelation = field(default_factory=RangeCorrelation)
     _sigma_count: float = SIGMA_R_COUNT
@@ -331,9 +333,25 @@ class LargeTeam:
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
+        if len(self._nodes) <= ONE_STRIP:
+            self._learn_detection(step.time_s, located, timeline)
         if located:
             self._collect(step.time_s, located)
         self._seek(step)
+
+    def _learn_detection(self, time_s: float, ranges: Sequence[Range], timeline: Timeline) -> None:
+        """Learn which ranges are lost: where walls lose them, they make the others too long."""
+        ended = self._detection.rounds.add(time_s, ranges, timeline.reported_s, self._on_one_floor)
+        for done in ended:
+            pairs = done.received + done.missed
+            rows = np.array([(self._row[a], self._row[b]) for a, b in pairs]).reshape(-1, 2)
+            distance_m, along_m2, *_ = self.filter.pairs(*np.ascontiguousarray(rows.T))
+            self._detection.update(done, distance_m, np.sqrt(along_m2))
+
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+        heights = [(self._known[a].vertical, self._known[b].vertical) for a, b in pairs]
+        dz_m = np.array([b.z_m - a.z_m for a, b in heights])
+        return on_one_floor(dz_m, np.array([a.sigma_z_m**2 + b.sigma_z_m**2 for a, b in heights]))
 
     def _collect(self, time_s: float, ranges: Sequence[Range]) -> None:
         """Put ranges aside, as excesses over the distances that are estimated at their instant."""
@@ -506,6 +524,7 @@ class LargeTeam:
             ("body_shadow_m", terms[CommonIndex.SHADOW], sigmas[CommonIndex.SHADOW]),
             ("range_lateness_s", late_s, sigmas[CommonIndex.LATENESS]),
             ("range_growth_m", terms[CommonIndex.GROWTH], sigmas[CommonIndex.GROWTH]),
+            ("range_scale", 1.0, self._detection.range_scale_sd),
         )
         delays, clocks = (self.filter.own_terms(term) for term in OwnTerm)
         own: dict[int, list[tuple[str, float, float]]] = {}
@@ -539,6 +558,7 @@ class LargeTeam:
         distance, along, across, bearing = self.filter.pairs(one, two)
         unknown = self.filter.spread_of_terms(one, two, bearing)
         along, across = along + unknown[0], across + unknown[1]
+        along += (self._detection.range_scale_sd * distance) ** 2
         bearing_rad2 = across / np.maximum(distance, 1e-9) ** 2 + self.filter.common[2, 2]
         sigma_bearing = np.minimum(np.sqrt(bearing_rad2), ANY_ANGLE_RAD)
         rows = zip(

@@ -141,16 +141,6 @@ without it, 1.7 so, 1.4 with .02, and with walls 8, 6 and 4 % beyond three sigma
 in sight 1.1, 1.0 and .84; ``mission-shadow``, seed 640, .88, .73 and .52, where .7 is the least
 that is wanted (docs/notebook/missions.md)."""
 
-WALLS_SCALE_SD = 0.03
-"""Standard deviation of the same where detection fades with distance as through walls, in
-proportion to how probable that is (``Detection.obstructed``).
-
-What walls add a metre, step scales and growth take for their own. Mixed missions with walls, seeds
-900 to 943 chose: distances 1 to 7 % too long. Fresh ones, 1000 to 1119: mean NEES 3.1, 8.3 % beyond
-three sigmas, 17 of 28 broken without; 2.0, 4.1 % and 12 with .02; 1.8, 3.5 % and 10 so; 1.6, 3.0 %
-and 9 with .04. Real teams in offices: 1.07 to 1.94 without, .86 to 1.56 so
-(docs/notebook/missions.md)."""
-
 
 def growth_slope(distance_m: float) -> float:
     """Return a range's slope in the growth; ``fusion/bank/range_update.py`` has it of lanes."""
