@@ -364,6 +364,21 @@ def test_a_tag_is_as_high_as_it_is_worn_and_its_wearer_has_climbed(size: int, cl
         assert [n.z_m for n in estimate.nodes] == pytest.approx([1.3] * size, abs=0.3)
 
 
+def test_a_large_team_that_ranges_between_floors_alone_learns_nothing_of_what_is_lost() -> None:
+    nodes = range(1, LARGE_TEAM + 3)
+    priors = [Prior(n, 3.0 * n, 0.0, 0.0, 0.1, 0.1) for n in nodes]
+    made, estimates = fusion.make("bank", priors, {}, 0), []
+    for second in range(1, 12):
+        for n in nodes:
+            estimates += made.process(Motion(float(second), n, 0.0, 0.0, 0.0))
+            estimates += made.process(Height(float(second), n, 4.0 * (n % 2), 0.1))
+        for n in nodes[:-1]:
+            estimates += made.process(Range(second - 0.5, n, n + 1, 5.0))
+    estimates += made.finish()
+    told = [p.sigma for p in estimates[-1].parameters if p.name == "range_scale"]
+    assert told == [0.0] * len(nodes)
+
+
 def test_places_and_bearings_in_the_common_frame_are_no_surer_than_right() -> None:
     """Of two missions: no range tells how a whole team has turned and shifted."""
     places, bearings = [], []

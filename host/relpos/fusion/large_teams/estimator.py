@@ -333,9 +333,9 @@ class LargeTeam:
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        if len(self._nodes) <= ONE_STRIP:
-            self._learn_detection(step.time_s, located, timeline)
         if located:
+            if len(self._nodes) <= ONE_STRIP:
+                self._learn_detection(step.time_s, located, timeline)
             self._collect(step.time_s, located)
         self._seek(step)
 
@@ -344,8 +344,10 @@ class LargeTeam:
         ended = self._detection.rounds.add(time_s, ranges, timeline.reported_s, self._on_one_floor)
         for done in ended:
             pairs = done.received + done.missed
-            rows = np.array([(self._row[a], self._row[b]) for a, b in pairs]).reshape(-1, 2)
-            distance_m, along_m2, *_ = self.filter.pairs(*np.ascontiguousarray(rows.T))
+            if not pairs:
+                continue
+            rows = np.array([[self._row[n] for n in ends] for ends in zip(*pairs, strict=True)])
+            distance_m, along_m2, *_ = self.filter.pairs(*rows)
             self._detection.update(done, distance_m, np.sqrt(along_m2))
 
     def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
