@@ -439,6 +439,15 @@ def refuse_unranged(ranges_used: int, counters: Mapping[str, int]) -> None:
         )
 
 
+def heights_apart(
+    known: Mapping[int, Presence], pairs: Sequence[tuple[int, int]]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return by how much the second of each pair is higher (P,), m, and the variances (P,), m^2."""
+    heights = [(known[a].vertical, known[b].vertical) for a, b in pairs]
+    dz_m = np.array([b.z_m - a.z_m for a, b in heights])
+    return dz_m, np.array([a.sigma_z_m**2 + b.sigma_z_m**2 for a, b in heights])
+
+
 def pairs_of(nodes: Sequence[NodeEstimate]) -> tuple[PairEstimate, ...]:
     """Give distance and bearing of every two nodes, their errors taken as independent.
 

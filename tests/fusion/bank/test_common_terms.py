@@ -192,38 +192,36 @@ def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     conditions = {"nodes": 5, "area_m": 30, "walls": 1, "max_range_m": 30, "range_rate_hz": 2.0}
-    runs = {
-        str(seed): relpos.simulate(
-            "mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions
-        )
+    runs = [
+        relpos.simulate("mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions)
         for seed in (701, 704, 705, 707)
-    }
+    ]
 
-    def too_sure(of: dict[str, relpos.Result]) -> float:
-        scores = [relpos.evaluate(of[name], runs[name], bound=False).metrics for name in runs]
+    def too_sure(results: list[relpos.Result]) -> float:
+        both = zip(results, runs, strict=True)
+        scores = [relpos.evaluate(result, run, bound=False).metrics for result, run in both]
         return float(np.mean([score.ok_over_3_sigma for score in scores]))
 
-    def without_scale(of: relpos.Result) -> relpos.Result:
+    def without_scale(result: relpos.Result) -> relpos.Result:
         """Take out of the distances' sigmas what is told of the ranges' scale."""
-        told = []
-        for e in of.estimates:
-            (sd,) = {p.sigma for p in e.parameters if p.name == "range_scale"} or {0.0}
-            pairs = [
-                dataclasses.replace(p, sigma_distance_m=math.sqrt(own_m2))
-                for p in e.pairs
-                for own_m2 in [p.sigma_distance_m**2 - (sd * p.distance_m) ** 2]
-            ]
-            told.append(dataclasses.replace(e, pairs=tuple(pairs)))
-        return dataclasses.replace(of, estimates=tuple(told))
+        estimates = []
+        for e in result.estimates:
+            sd = next((p.sigma for p in e.parameters if p.name == "range_scale"), 0.0)
+            pairs = []
+            for p in e.pairs:
+                own_m2 = p.sigma_distance_m**2 - (sd * p.distance_m) ** 2
+                pairs.append(dataclasses.replace(p, sigma_distance_m=math.sqrt(own_m2)))
+            estimates.append(dataclasses.replace(e, pairs=tuple(pairs)))
+        return dataclasses.replace(result, estimates=tuple(estimates))
 
-    so = too_sure({name: relpos.fuse(run) for name, run in runs.items()})
-    assert so < 0.015
+    with_walls = too_sure([relpos.fuse(run) for run in runs])
+    assert with_walls < 0.015
     monkeypatch.setattr(detection, "WALLS_SCALE_SD", 0.0)
-    biases_alone = {name: relpos.fuse(run) for name, run in runs.items()}
+    results = [relpos.fuse(run) for run in runs]
+    biases_alone = too_sure(results)
     # 0.004, 0.016 and 0.048.
-    assert so < 0.5 * too_sure(biases_alone)
-    without = {name: without_scale(result) for name, result in biases_alone.items()}
-    assert too_sure(biases_alone) < 0.5 * too_sure(without)
+    assert with_walls < 0.5 * biases_alone
+    assert biases_alone < 0.5 * too_sure([without_scale(result) for result in results])
 
 
 @pytest.mark.parametrize("seed", [602, pytest.param(603, marks=pytest.mark.soak)])

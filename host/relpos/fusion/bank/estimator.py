@@ -28,6 +28,7 @@ from relpos.fusion.estimator import (
     Estimate,
     Presence,
     Vertical,
+    heights_apart,
     refuse_unmoved,
     refuse_unranged,
 )
@@ -437,12 +438,10 @@ class Bank:
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats, Floats]:
         """Return the rows of pairs, their differences of height (m) and those's variances."""
-        row, known = self._row, self._known
+        row = self._row
         rows = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
         first, second = np.ascontiguousarray(rows.T)
-        heights = [(known[a].vertical, known[b].vertical) for a, b in pairs]
-        dz = np.array([b.z_m - a.z_m for a, b in heights])
-        return first, second, dz, np.array([a.sigma_z_m**2 + b.sigma_z_m**2 for a, b in heights])
+        return first, second, *heights_apart(self._known, pairs)
 
     def _attempts(
         self, time_s: float, ranges: Sequence[Range], timeline: Timeline
@@ -466,8 +465,7 @@ class Bank:
         return rounds
 
     def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
-        _, _, dz, variance = self._pairs(pairs)
-        return on_one_floor(dz, variance)
+        return on_one_floor(*heights_apart(self._known, pairs))
 
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement

@@ -26,6 +26,7 @@ from relpos.fusion.estimator import (
     Parameter,
     Presence,
     Vertical,
+    heights_apart,
     refuse_unmoved,
     refuse_unranged,
     unlocated,
@@ -351,19 +352,19 @@ class LargeTeam:
             self._detection.update(done, distance_m, np.sqrt(along_m2))
 
     def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
-        heights = [(self._known[a].vertical, self._known[b].vertical) for a, b in pairs]
-        dz_m = np.array([b.z_m - a.z_m for a, b in heights])
-        return on_one_floor(dz_m, np.array([a.sigma_z_m**2 + b.sigma_z_m**2 for a, b in heights]))
+        return on_one_floor(*heights_apart(self._known, pairs))
 
     def _collect(self, time_s: float, ranges: Sequence[Range]) -> None:
         """Put ranges aside, as excesses over the distances that are estimated at their instant."""
         rows = np.array([self._row[n] for r in ranges for n in (r.node, r.peer)])
         places_m = self.filter.antennas_m(rows).reshape(-1, 4).tolist()
         headings = self.filter.pose[rows, 2].reshape(-1, 2).tolist()
-        for r, (x, y, peer_x, peer_y), facing in zip(ranges, places_m, headings, strict=True):
+        apart = heights_apart(self._known, [(r.node, r.peer) for r in ranges])
+        heights = zip(*(each.tolist() for each in apart), strict=True)
+        for r, (x, y, peer_x, peer_y), facing, (height_m, variance_m2) in zip(
+            ranges, places_m, headings, heights, strict=True
+        ):
             ends = self._known[r.node], self._known[r.peer]
-            height_m = ends[1].vertical.z_m - ends[0].vertical.z_m
-            variance_m2 = sum(known.vertical.sigma_z_m**2 for known in ends)
             horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2

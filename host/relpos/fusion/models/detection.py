@@ -306,7 +306,7 @@ class _Family:
     """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
     edge_m: Floats
     fades: npt.NDArray[np.bool_]
-    """(F,) the softest."""
+    """(F,) those of walls (``FADES_WITHIN_M``)."""
 
 
 @cache
