@@ -100,6 +100,11 @@ TOGETHER_S = 0.05
 ranges. In the meantime people walk on, so that each range is brought forward by how the estimated
 distance has changed since; what a heading error of 10 degrees does to that is 0.02 m."""
 
+HEIGHTS_WITHIN_S = 1.0
+"""Nodes that report heights have all done so after so long. Until then a range between floors would
+be taken for a level one, and what all ranges have in common be learned from it: none is used. 24
+people on two floors with heights (15 m, seeds 3000 and 3001): NEES 1.9 with them, .7 without."""
+
 MOSTLY_OUTLYING = 0.5
 """From this fraction of outliers on a node's pose, and not its ranges, is taken to be wrong."""
 TURNED_RAD = 0.3
@@ -151,6 +156,7 @@ class LargeTeam:
     _reach_m: float = 0.0
     _moved: bool = False
     _ranges_used: int = 0
+    _first_s: float = math.inf
     _epoch_s: float = -math.inf
 
     def __post_init__(self) -> None:
@@ -180,6 +186,7 @@ class LargeTeam:
 
     def update(self, step: Step, timeline: Timeline) -> Estimate | None:
         """Process one step; an estimate at the end of an epoch."""
+        self._first_s = min(self._first_s, step.time_s)
         match step:
             case Advance():
                 self._moved = True
@@ -334,7 +341,9 @@ class LargeTeam:
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        if located:
+        if step.time_s < self._first_s + HEIGHTS_WITHIN_S:
+            self._own["ranges_before_heights"] += len(located)
+        elif located:
             if len(self._nodes) <= ONE_STRIP:
                 self._learn_detection(step.time_s, located, timeline)
             self._collect(step.time_s, located)
