@@ -123,7 +123,7 @@ class _Collected(NamedTuple):
     """By how much it exceeded the distance that was estimated at its instant."""
     slopes: tuple[float, ...]
     variance_m2: float
-    """What uncertain heights add to the range's."""
+    """What uncertain heights, and ways within reports, add to the range's."""
 
 
 @dataclass(slots=True)
@@ -381,7 +381,9 @@ class LargeTeam:
             near_m = max(apart_m, NEAREST_M)
             sight = (peer_x - x) / near_m, (peer_y - y) / near_m
             slopes = slopes_of(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
-            self._collected.append(_Collected(r, horizontal_m - apart_m, slopes, lifted_m2))
+            within_m2 = sum(k.within.range_variance_m2() for k in ends)
+            excess_m = horizontal_m - apart_m
+            self._collected.append(_Collected(r, excess_m, slopes, lifted_m2 + within_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
         self._collected_s = min(self._collected_s, time_s)
         self._ranges_used += len(ranges)
