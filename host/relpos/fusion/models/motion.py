@@ -95,6 +95,8 @@ class WithinReport:
 
     variance_m2: float = 0.0
     """Along any one direction."""
+    long: bool = False
+    """Whether the report takes longer than people keep their direction (``WALK_S``)."""
     _done: float = 0.0
     _before_m_s: float = 0.0
     _ranges: int = 0
@@ -105,6 +107,7 @@ class WithinReport:
         if duration_s <= 0.0 or fraction <= 0.0:
             return
         speed = length_m / duration_s
+        self.long = duration_s > WALK_S * fraction
         self._done += fraction
         if self._done > 1.0 - 1e-6:
             self._usual_ranges += RANGES_SHARE * (self._ranges - self._usual_ranges)
