@@ -126,6 +126,18 @@ class _Collected(NamedTuple):
     """What uncertain heights, and ways within reports, add to the range's."""
 
 
+def _within_m2(of: Presence, time_s: float) -> float:
+    """Return the variance by which a range of a node within its report is less exact (m^2).
+
+    All ranges within a long report have its error in common. Those of a second are of so many pairs
+    that NEES would be .55 to .75 so, where it is .64 to .96. Who walks unseen is where ranges say.
+    """
+    in_common = of.within.range_variance_m2()
+    if of.diffused_s >= time_s:
+        return 0.0
+    return in_common if of.within.long else of.within.variance_m2
+
+
 @dataclass(slots=True)
 class LargeTeam:
     """The core of the estimator (:class:`~relpos.fusion.rewind.Core`)."""
@@ -381,10 +393,7 @@ class LargeTeam:
             near_m = max(apart_m, NEAREST_M)
             sight = (peer_x - x) / near_m, (peer_y - y) / near_m
             slopes = slopes_of(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
-            # All ranges in a long report have its error in common; those of a second's are many, of
-            # many pairs: as in the bank NEES would be .55 to .75 where it is .64 to .96.
-            within = [(k.within.range_variance_m2(), k.within) for k in ends]
-            within_m2 = sum(all_m2 if w.long else w.variance_m2 for all_m2, w in within)
+            within_m2 = sum(_within_m2(k, time_s) for k in ends)
             excess_m = horizontal_m - apart_m
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2 + within_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
