@@ -433,7 +433,9 @@ class Detection:
         self.curve = (posterior.astype(np.float32) @ family.curves[likely]).astype(np.float64)
         edge_m = family.edge_m[likely]
         self.range_m = float(posterior @ edge_m)
-        fades, at_first = float(posterior @ family.fades[likely]), float(family.fades.mean())
+        fades = float(posterior @ family.fades[likely])
+        # Summed alike, so that nothing is told at first.
+        at_first = float(np.full(len(family.fades), 1.0 / len(family.fades)) @ family.fades)
         self.obstructed = max(fades - at_first, 0.0) / (1.0 - at_first)
         spread = float(posterior @ (edge_m - self.range_m) ** 2)
         self.range_sigma_m = math.sqrt(spread + (SHAPE * self.range_m) ** 2 + STEP_M**2 / 12.0)
