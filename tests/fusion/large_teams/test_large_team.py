@@ -364,6 +364,28 @@ def test_a_tag_is_as_high_as_it_is_worn_and_its_wearer_has_climbed(size: int, cl
         assert [n.z_m for n in estimate.nodes] == pytest.approx([1.3] * size, abs=0.3)
 
 
+@pytest.mark.parametrize(
+    ("amiss", "most_m", "most_nees"),
+    [
+        # While ranges before the first heights taught of all later ones: .18 m, NEES .9.
+        ({"floors": 2, "heights": 1, "area_m": 15}, 0.14, 0.7),
+        # While reports of six seconds were taken for even walks: NEES 1.6.
+        ({"range_late_s": 0.6, "gap_s": 5, "range_rate_hz": 0.3}, 0.26, 1.4),
+    ],
+)
+def test_ranges_before_heights_and_within_long_reports_mislead_no_large_team(
+    amiss: dict[str, float], most_m: float, most_nees: float
+) -> None:
+    errors_m, nees = [], []
+    for seed in (31, 32):
+        run = relpos.simulate("mission-base", seed, nodes=LARGE_TEAM, seconds=40, **amiss)
+        scored = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
+        errors_m.append(scored.relative_distance_rmse_m)
+        nees.append(scored.nees_distance)
+    assert np.mean(errors_m) < most_m
+    assert np.mean(nees) < most_nees
+
+
 def test_a_large_team_that_ranges_between_floors_alone_learns_nothing_of_what_is_lost() -> None:
     nodes = range(1, LARGE_TEAM + 3)
     priors = [Prior(n, 3.0 * n, 0.0, 0.0, 0.1, 0.1) for n in nodes]

@@ -95,6 +95,8 @@ def outcomes(law: Callable[[float], float], rounds: int) -> Detection:
         # Half are lost for each wall, of which there is one every eight metres.
         (lambda distance_m: 0.9 * 0.5 ** (distance_m / 8.0), True),
         (lambda distance_m: 0.4 * 0.5 ** (distance_m / 8.0), True),
+        # Between two curves of the family, whose half is at 12 m.
+        (lambda distance_m: 0.95 / (1.0 + math.exp((distance_m / 12.0 - 1.0) / 0.3)), True),
         (lambda _: 0.9, False),
         (lambda _: 0.4, False),
         (lambda distance_m: 0.7 * (distance_m < 15.0), False),

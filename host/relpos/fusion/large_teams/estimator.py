@@ -100,10 +100,11 @@ TOGETHER_S = 0.05
 ranges. In the meantime people walk on, so that each range is brought forward by how the estimated
 distance has changed since; what a heading error of 10 degrees does to that is 0.02 m."""
 
-HEIGHTS_WITHIN_S = 1.0
-"""Nodes that report heights have all done so after so long. Until then a range between floors would
-be taken for a level one, and what all ranges have in common be learned from it: none is used. 24
-people on two floors with heights (15 m, seeds 3000 and 3001): NEES 1.9 with them, .7 without."""
+HEIGHTS_WITHIN_S, APART_M = 1.0, 1.0
+"""So long after the first height all nodes have reported one. Where they are farther apart, ranges
+between floors were taken for level ones until then; what all ranges have in common was learned from
+them, and is forgotten. 24 people on two floors with heights (15 m, seeds 3000 and 3001): .16 m,
+NEES 1.9 where it is not."""
 
 MOSTLY_OUTLYING = 0.5
 """From this fraction of outliers on a node's pose, and not its ranges, is taken to be wrong."""
@@ -166,7 +167,8 @@ class LargeTeam:
     _reach_m: float = 0.0
     _moved: bool = False
     _ranges_used: int = 0
-    _first_s: float = math.inf
+    _heights_s: float = math.inf
+    """When the first height was reported; -inf once all nodes can have reported theirs."""
     _epoch_s: float = -math.inf
 
     def __post_init__(self) -> None:
@@ -196,7 +198,6 @@ class LargeTeam:
 
     def update(self, step: Step, timeline: Timeline) -> Estimate | None:
         """Process one step; an estimate at the end of an epoch."""
-        self._first_s = min(self._first_s, step.time_s)
         match step:
             case Advance():
                 self._moved = True
@@ -210,6 +211,7 @@ class LargeTeam:
                 self._use_ranges(step, timeline)
             case Sensed(measurement=Height() as height):
                 self._presence(height.node)
+                self._heights_s = min(self._heights_s, step.time_s)
                 self._own["heights_stuck"] += not self.vertical.measure(height, step.time_s)
             case Sensed():
                 self._presence(step.measurement.node)
@@ -260,6 +262,11 @@ class LargeTeam:
         for node, known in self._known.items():
             vertical, tag_m = self.vertical.of(node, time_s), tag_height_m(self.mountings, node)
             known.vertical = vertical._replace(z_m=tag_m + vertical.z_m)
+        if -math.inf < self._heights_s < time_s - HEIGHTS_WITHIN_S:
+            self._heights_s = -math.inf
+            z_m = [known.vertical.z_m for known in self._known.values()]
+            if max(z_m) - min(z_m) > APART_M:
+                self.filter.forget_terms(prior_information(self.settings.bias_m))
 
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not nodes:
@@ -351,9 +358,7 @@ class LargeTeam:
         for measured in step.ranges:
             self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        if step.time_s < self._first_s + HEIGHTS_WITHIN_S:
-            self._own["ranges_before_heights"] += len(located)
-        elif located:
+        if located:
             if len(self._nodes) <= ONE_STRIP:
                 self._learn_detection(step.time_s, located, timeline)
             self._collect(step.time_s, located)

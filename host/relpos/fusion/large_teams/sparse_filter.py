@@ -172,9 +172,21 @@ class NeighbourhoodFilter:
             self.terms_information = np.asarray(np.linalg.inv(known), np.float64)
         self.terms = np.pad(self.terms, (0, own.size))
         self._carried = np.pad(self._carried, ((0, more), (0, 0), (0, own.size)))
-        information = np.diag(1.0 / (own**2 + JITTER_CONSTANT))
-        known = block_diag(self.terms_information, information)
-        self.terms_information = np.asarray(known, np.float64)
+        self._know_terms(self.terms_information, own)
+
+    def _know_terms(self, known: Floats, own_sd: Floats) -> None:
+        """Take over the information of some terms, and of those after them by their deviations."""
+        information = block_diag(known, np.diag(1.0 / (own_sd**2 + JITTER_CONSTANT)))
+        self.terms_information = np.asarray(information, np.float64)
+
+    def forget_terms(self, known: Floats) -> None:
+        """Begin anew with the terms: what all ranges have in common has the information ``known``.
+
+        States go back to what they would be without.
+        """
+        self.state -= self._carried @ self.terms
+        self.terms = np.zeros_like(self.terms)
+        self._know_terms(known, np.tile(self.own_sd, len(self.state)))
 
     def _lay_out(self, whole: Floats) -> None:
         """Choose the strips' direction and cut the covariance (5N, 5N) into blocks."""
