@@ -378,7 +378,7 @@ def test_ranges_before_heights_and_within_long_reports_mislead_no_large_team(
 ) -> None:
     errors_m, nees = [], []
     for seed in (31, 32):
-        run = relpos.simulate("mission-base", seed, nodes=LARGE_TEAM, seconds=40, **amiss)
+        run = relpos.simulate("mission-base", seed, nodes=LARGE_TEAM + 1, seconds=40, **amiss)
         scored = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
         errors_m.append(scored.relative_distance_rmse_m)
         nees.append(scored.nees_distance)
