@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.models.motion import WALK_S, WithinReport
+from relpos.fusion.models.motion import WALK_S, WithinReport, is_long
 from relpos.fusion.models.odometry_faults import STILL_M_S
 from relpos.fusion.models.unseen_walk import AXIS_M2_S2, UnseenWalk
 from relpos.fusion.timeline import Advance
@@ -356,7 +356,7 @@ class Presence:
 
     def leads_nowhere(self, a: Advance) -> bool:
         """Return whether a report came too late, and is too long, to say where its end led to."""
-        return a.duration_s > WALK_S * a.fraction and self._walks_unseen
+        return is_long(a.duration_s, a.fraction) and self._walks_unseen
 
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""

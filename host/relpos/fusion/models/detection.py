@@ -308,7 +308,9 @@ class _Family:
     """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
     edge_m: Floats
     fades: npt.NDArray[np.bool_]
-    """(F,) those of walls (``FADES_WITHIN_M``)."""
+    """(F,) those of walls (``FADES_SOFTLY``, ``FADES_WITHIN_M``)."""
+    fades_at_first: float
+    """How probable these are while all curves are alike, summed as a posterior is."""
 
 
 @cache
@@ -321,12 +323,14 @@ def _family() -> _Family:
     curves = near / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
     curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
     single = np.float32
+    fades = (soft.ravel() >= FADES_SOFTLY) & (edge.ravel() < FADES_WITHIN_M)
     return _Family(
         curves.astype(single),
         np.ascontiguousarray(np.log1p(-curves).T.astype(single)),
         np.ascontiguousarray(np.log(curves).T.astype(single)),
         edge.ravel(),
-        (soft.ravel() >= FADES_SOFTLY) & (edge.ravel() < FADES_WITHIN_M),
+        fades,
+        float(np.full(len(fades), 1.0 / len(fades)) @ fades),
     )
 
 
@@ -433,9 +437,7 @@ class Detection:
         self.curve = (posterior.astype(np.float32) @ family.curves[likely]).astype(np.float64)
         edge_m = family.edge_m[likely]
         self.range_m = float(posterior @ edge_m)
-        fades = float(posterior @ family.fades[likely])
-        # Summed alike, so that nothing is told at first.
-        at_first = float(np.full(len(family.fades), 1.0 / len(family.fades)) @ family.fades)
+        fades, at_first = float(posterior @ family.fades[likely]), family.fades_at_first
         self.obstructed = max(fades - at_first, 0.0) / (1.0 - at_first)
         spread = float(posterior @ (edge_m - self.range_m) ** 2)
         self.range_sigma_m = math.sqrt(spread + (SHAPE * self.range_m) ** 2 + STEP_M**2 / 12.0)

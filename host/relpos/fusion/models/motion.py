@@ -74,8 +74,16 @@ def reported_sigmas(step: Advance) -> tuple[float, float, float]:
     )
 
 
+WALK_M_S, WALK_S = 1.0, 4.0
+"""Speed of a person of whom no motion is reported, and how long it keeps its direction."""
+
 RANGES_SHARE = 0.2
 """Weight of a report in the usual number of ranges within one."""
+
+
+def is_long(duration_s: float, fraction: float) -> bool:
+    """Whether a report takes longer than people walk straight; its ``fraction`` took so long."""
+    return duration_s > WALK_S * fraction
 
 
 @dataclass(slots=True)
@@ -96,7 +104,7 @@ class WithinReport:
     variance_m2: float = 0.0
     """Along any one direction."""
     long: bool = False
-    """Whether the report takes longer than people keep their direction (``WALK_S``)."""
+    """Of the report (:func:`is_long`)."""
     _done: float = 0.0
     _before_m_s: float = 0.0
     _ranges: int = 0
@@ -107,7 +115,7 @@ class WithinReport:
         if duration_s <= 0.0 or fraction <= 0.0:
             return
         speed = length_m / duration_s
-        self.long = duration_s > WALK_S * fraction
+        self.long = is_long(duration_s, fraction)
         self._done += fraction
         if self._done > 1.0 - 1e-6:
             self._usual_ranges += RANGES_SHARE * (self._ranges - self._usual_ranges)
@@ -126,10 +134,6 @@ class WithinReport:
         """Add a range; return the variance by which it counts as less exact."""
         self._ranges += 1
         return max(self._usual_ranges, 1.0) * self.variance_m2
-
-
-WALK_M_S, WALK_S = 1.0, 4.0
-"""Speed of a person of whom no motion is reported, and how long it keeps its direction."""
 
 
 def unseen_variance(duration_s: float) -> float:

@@ -168,13 +168,14 @@ class VerticalFilter:
     posts: frozenset[int] = frozenset()
     heights: Heights = field(default_factory=Heights)
     floors: Floors = field(default_factory=Floors)
+    first_s: float = math.inf
+    """When the first height was reported."""
     decided: list[Decided] | None = None
     """Everything decided, where somebody wants it."""
     _row: dict[int, int] = field(default_factory=dict)
     _tracks: dict[int, Track] = field(default_factory=dict)
     _beliefs: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
     _open: list[_Interval] = field(default_factory=list)
-    _first_s: float = math.inf
     _closed_s: float = -math.inf
     _level_s: Floats = field(default_factory=lambda: np.empty(0))
     """How long each has been level since it last changed its height."""
@@ -193,7 +194,7 @@ class VerticalFilter:
     @property
     def active(self) -> bool:
         """Whether anybody has reported a height."""
-        return self._first_s < math.inf
+        return self.first_s < math.inf
 
     # -- measurements --------------------------------------------------------------------------
 
@@ -205,7 +206,7 @@ class VerticalFilter:
         """Add a reported height, at its time in the order of steps; False from a stuck sensor."""
         node = measured.node
         if not self.active:
-            self._first_s = self._closed_s = time_s
+            self.first_s = self._closed_s = time_s
         if node in self.posts:
             return True
         track = self._track(node)
@@ -213,7 +214,7 @@ class VerticalFilter:
         if unseen_s > 0.0:
             self.heights.doubt(self._row[node], UNSEEN_M * math.sqrt(unseen_s))
         elif node not in self._row:
-            self._add(node, track, late=time_s > self._first_s + LATE_S)
+            self._add(node, track, late=time_s > self.first_s + LATE_S)
         return track.height_s == time_s
 
     def _track(self, node: int) -> Track:
@@ -507,7 +508,7 @@ class VerticalFilter:
         """A node that never reported a height: it may have climbed since the start."""
         if not self.active:
             return Vertical()
-        grown = START_M**2 + UNSEEN_M**2 * max(time_s - self._first_s, 0.0)
+        grown = START_M**2 + UNSEEN_M**2 * max(time_s - self.first_s, 0.0)
         return Vertical(0.0, min(math.sqrt(grown), UNKNOWN_M))
 
 
