@@ -1,7 +1,7 @@
 """Dead reckoning on simulated wearers: what is claimed, against the truth that is known.
 
 The wearers are those of ``wearers.solo.make_walker``; the sensors are the emulator's
-MPU-9150 (DLPF 4, 4 g, 500 deg/s) and AK8975. `simulate` gives one walk for work on the filter:
+MPU-9150 (DLPF 4, 4 g, 1000 deg/s) and AK8975. `simulate` gives one walk for work on the filter:
 
     imu, field_ut, truth = simulate("mixed", seed=3)      # (n, 6), (n, 3) at 50 Hz, WearerTruth
     result = replay.reckon(imu, field_ut, leg_length_m=truth.person.leg_length_m)

@@ -100,6 +100,25 @@ def test_what_a_request_lacks_is_named_in_plain_words(kind, lacking):
         Board().apply(event(kind))
 
 
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (event("rollcall", action="start", nodes=7), "nodes: not a list"),
+        (event("evacuate", action="order", nodes="12"), "nodes: not a list"),
+        (event("rollcall", action="start", nodes=[1], within_s="soon"), "within_s: not from 0"),
+        (event("marker", id="m", action="set", sign=["exit"]), "sign: none of "),
+        (event("plan", action="set", image=5), "image: not the name of an image"),
+        (event("board", node=[2], state="entered"), "board: a value is of the wrong type"),
+    ],
+    ids=str,
+)
+def test_a_value_of_the_wrong_type_is_refused_in_plain_words(bad, words):
+    board = Board()
+    with pytest.raises(BoardError, match=f"^{words}"):
+        board.apply(bad)
+    assert board == Board()
+
+
 def test_the_same_events_give_the_same_board():
     events = [
         event("board", node=1, state="standby"),

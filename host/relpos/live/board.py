@@ -169,8 +169,8 @@ class Board:
             raise
         except KeyError as error:
             raise BoardError(f"{error.args[0]}: is missing") from None
-        except (TypeError, ValueError, OverflowError) as error:
-            raise BoardError(f"not a request that the board knows: {error!r}") from None
+        except (TypeError, ValueError, OverflowError):
+            raise BoardError(f"{event['kind']}: a value is of the wrong type") from None
 
     def _board(self, event: Mapping[str, Any]) -> Said | None:
         place = self.people.get(event["node"], Place())
@@ -211,8 +211,8 @@ class Board:
         call, action = self.roll_call, event.get("action")
         if action == "start":
             nodes = _nodes(event["nodes"])
-            within_s = float(event.get("within_s", ROLL_CALL_S))
-            if not 0.0 < within_s <= 7200.0:
+            within_s = event.get("within_s", ROLL_CALL_S)
+            if type(within_s) not in (int, float) or not 0.0 < within_s <= 7200.0:
                 raise BoardError("within_s: not from 0 to 7200 s")
             emergency = bool(event.get("emergency"))
             self.roll_call = RollCall(event["unix_s"], within_s, event["by"], emergency, nodes)
@@ -258,7 +258,7 @@ class Board:
             if self.markers.pop(name, None) is None:
                 raise BoardError(Said("no-marker", "no such marker"))
             return Said("unmarked", "{whom}marker removed", whom="")
-        if event.get("sign") not in SIGNS or event.get("action") != "set":
+        if event.get("sign") not in list(SIGNS) or event.get("action") != "set":
             raise BoardError(f"sign: none of {', '.join(SIGNS)}")
         if len(self.markers) >= MOST_MARKERS:
             raise BoardError(Said("many-markers", "more than {most} markers", most=MOST_MARKERS))
@@ -268,8 +268,11 @@ class Board:
 
     def _plan(self, event: Mapping[str, Any]) -> Said | None:
         action = event.get("action")
-        if action == "set" and re.fullmatch(IMAGE, event["image"], re.ASCII):
-            self.plan = Plan(event["image"])
+        if action == "set":
+            image = event["image"]
+            if not isinstance(image, str) or not re.fullmatch(IMAGE, image, re.ASCII):
+                raise BoardError("image: not the name of an image")
+            self.plan = Plan(image)
             return Said("plan", "{whom}a plan lies under the map", whom="")
         if self.plan is None:
             raise BoardError(Said("without-plan", "there is no plan"))
@@ -333,7 +336,9 @@ class Board:
 
 
 def _nodes(values: Any) -> list[int]:
-    """Return the numbers of nodes among the values, each once."""
+    """Return the numbers of nodes in a list, each once. BoardError."""
+    if not isinstance(values, list):
+        raise BoardError("nodes: not a list")
     return sorted({node for node in values if type(node) is int and 0 < node < 255})
 
 
