@@ -119,6 +119,13 @@ def test_a_value_of_the_wrong_type_is_refused_in_plain_words(bad, words):
     assert board == Board()
 
 
+@pytest.mark.parametrize("within_s", [600, 600.0, "600"])
+def test_the_time_of_a_roll_call_may_be_any_numeral(within_s):
+    board = Board()
+    board.apply(event("rollcall", action="start", nodes=[1], within_s=within_s))
+    assert repr(board.roll_call.within_s) == "600.0"
+
+
 def test_the_same_events_give_the_same_board():
     events = [
         event("board", node=1, state="standby"),

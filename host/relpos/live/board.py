@@ -7,6 +7,7 @@ journal gives it back; a request that makes no sense is refused with a sentence 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -211,8 +212,8 @@ class Board:
         call, action = self.roll_call, event.get("action")
         if action == "start":
             nodes = _nodes(event["nodes"])
-            within_s = event.get("within_s", ROLL_CALL_S)
-            if type(within_s) not in (int, float) or not 0.0 < within_s <= 7200.0:
+            within_s = _number(event.get("within_s", ROLL_CALL_S))
+            if not 0.0 < within_s <= 7200.0:
                 raise BoardError("within_s: not from 0 to 7200 s")
             emergency = bool(event.get("emergency"))
             self.roll_call = RollCall(event["unix_s"], within_s, event["by"], emergency, nodes)
@@ -340,6 +341,14 @@ def _nodes(values: Any) -> list[int]:
     if not isinstance(values, list):
         raise BoardError("nodes: not a list")
     return sorted({node for node in values if type(node) is int and 0 < node < 255})
+
+
+def _number(value: Any) -> float:
+    """Return the value as a number; NaN, which is within no bounds, where it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def _numbers(values: Any, count: int = 2) -> list[float]:
