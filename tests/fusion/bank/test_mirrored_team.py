@@ -195,10 +195,14 @@ def crosses_a_line(seed: int) -> tuple[np.ndarray, np.ndarray, list[Measurement]
     return places, headings, rows
 
 
-# Of 24 seeds these were told wrong.
+# Of 24 seeds these were told wrong; of 80 others 38 and 47 still, when hypotheses alone were
+# asked: in 38 the noise of a heading passed for a bend, in 47 they were never on both sides.
 @pytest.mark.parametrize(
     "seed",
-    [2, 3, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 5, 8, 9, 15, 17, 20, 23))],
+    [
+        *(2, 3, 38, 47),
+        *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 5, 8, 9, 15, 17, 20, 23)),
+    ],
 )
 def test_who_leaves_a_line_is_not_told_on_the_wrong_side(seed: int) -> None:
     places, headings, rows = crosses_a_line(seed)
@@ -224,23 +228,76 @@ def test_three_of_whom_one_may_be_on_either_side_are_open_and_no_others() -> Non
     places[:, 2] += 2j * np.where(np.arange(100) < 30, -1.0, 1.0)
     near = np.abs(line[:, None] - line) < 50.0
     even = np.full(100, 0.01)
-    assert open_sides(places, even, near).tolist() == [True] * 3 + [False] * 3
-    assert not open_sides(places, even, np.eye(6, dtype=bool)).any()
+    sides, in_line = open_sides(places, even, near)
+    assert sides.tolist() == [True] * 3 + [False] * 3
+    assert not in_line[3:].any()
+    assert not np.any(open_sides(places, even, np.eye(6, dtype=bool)))
     # Seven in a hundred are left out.
-    assert not open_sides(places, np.where(np.arange(100) < 30, 0.07 / 30, 0.93 / 70), near).any()
+    few = np.where(np.arange(100) < 30, 0.07 / 30, 0.93 / 70)
+    assert not np.any(open_sides(places, few, near))
     # A place that is not known at all is on no side.
     places[:, 2] = line[2] + 3j * rng.normal(size=100)
-    assert not open_sides(places, even, near).any()
+    sides, in_line = open_sides(places, even, near)
+    assert not sides.any()
+    assert in_line.tolist() == [True] * 3 + [False] * 3
+
+
+def test_hypotheses_that_agree_on_a_side_of_a_line_are_in_it_all_the_same() -> None:
+    near = np.ones((3, 3), dtype=bool)
+    for high_m, is_in_line in ((0.5, True), (1.0, False)):
+        one = np.array([[0.0, 10.0 + 1j * high_m, 20.0]])
+        sides, in_line = open_sides(one, np.ones(1), near)
+        assert not sides.any()
+        assert in_line.tolist() == [is_in_line] * 3
 
 
 def test_a_bent_way_tells_the_side_of_those_alone_whose_distance_to_it_is_known() -> None:
     handedness = Handedness()
     near = {1: {2, 3}, 2: {1, 3}, 3: {1, 2}, 4: {5}, 5: {4}}
-    assert handedness.unsure({1, 2, 3, 4}, near) == {1, 2, 3, 4}
+    assert handedness.unsure({1, 2, 3, 4}, near, {}) == {1, 2, 3, 4}
     for _ in range(6):
         handedness.move(Advance(0.0, 5, 1.0, 1.0, 0.0, 0.5))
-    assert handedness.unsure(set(), near) == {1, 2, 3}
-    assert handedness.unsure(set(), near | {3: {1, 2, 4, 5, 6}, 6: {3}}) == {1, 2}
+    assert handedness.unsure(set(), near, {}) == {1, 2, 3}
+    assert handedness.unsure(set(), near | {3: {1, 2, 4, 5, 6}, 6: {3}}, {}) == {1, 2}
     for _ in range(6):
         handedness.move(Advance(0.0, 3, 1.0, 1.0, 0.0, 0.5))
-    assert handedness.unsure(set(), near) == set()
+    assert handedness.unsure(set(), near, {}) == set()
+
+
+def go(handedness: Handedness, seconds: int, turn_rad: float = 0.0) -> None:
+    for _ in range(seconds):
+        handedness.move(Advance(0.0, 1, 1.0, 1.0, 0.0, turn_rad))
+
+
+@pytest.mark.parametrize(
+    ("sigma_rad", "seconds", "turn_rad", "is_open"),
+    [(0.2, 9, 0.0, True), (0.1, 9, 0.0, False), (0.2, 3, 0.0, False), (0.2, 9, 0.3, False)],
+)
+def test_who_leaves_a_line_may_be_on_either_side_if_neither_heading_nor_turns_tell(
+    sigma_rad: float, seconds: int, turn_rad: float, is_open: bool
+) -> None:
+    handedness, near = Handedness(), {1: {2, 3}, 2: {1, 3}, 3: {1, 2}}
+    for _ in range(seconds):
+        assert handedness.unsure(set(), near, {1: sigma_rad}) == set()
+        go(handedness, 1, turn_rad)
+    assert handedness.unsure(set(), near, {1: sigma_rad}) == set()
+    assert handedness.unsure(set(), near, {}) == ({1} if is_open else set())
+    go(handedness, 60)
+    assert handedness.unsure(set(), near, {}) == ({1} if is_open else set())
+    go(handedness, 6, 0.5)
+    assert handedness.unsure(set(), near, {}) == set()
+
+
+def test_the_noise_of_a_heading_bends_no_way_and_a_corner_does() -> None:
+    bent = 0
+    for seed in range(200):
+        rng, handedness = np.random.default_rng(seed), Handedness()
+        handedness.unsure({1}, {1: set()}, {})
+        for _ in range(160):
+            turn_rad = math.radians(2.0) * rng.normal()
+            handedness.move(Advance(0.0, 1, 1.0, 0.8, 0.0, turn_rad))
+            bent += 1 not in handedness.unsure(set(), {1: set()}, {})
+        go(handedness, 1, 0.5 * math.pi)
+        go(handedness, 4)
+        assert handedness.unsure(set(), {1: set()}, {}) == set()
+    assert bent == 0

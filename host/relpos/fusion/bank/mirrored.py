@@ -18,15 +18,13 @@ from relpos.fusion.bank import storage
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.estimator import VAGUE_PAIR_M
+from relpos.fusion.models.handedness import ASIDE_M, BETWEEN_M
 
 Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
 
 VAGUE_RAD = math.radians(45.0)
 """A user whose heading relative to every peer's has a larger standard deviation is ambiguous."""
-
-ASIDE_M = 0.7
-"""Three are in a line while their triangle is lower."""
 
 APART = 4.0
 """Two sides are apart by so many deviations within them at least; halves of a bell are by 2.6."""
@@ -38,8 +36,8 @@ side, ``mission-split-hard``, seeds 740 to 747, and of what is ``ok`` there, wit
 99, 99, with 0.1 0.3 %; 96, 99, 98, with 0.02 0.1 %; 93, 93, 90."""
 
 
-def unknown_headings(covariance: Floats, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Tell whose heading (N,) is too uncertain relative to every other's.
+def heading_sigmas(covariance: Floats, rows: npt.NDArray[np.int64]) -> Floats:
+    """Return the standard deviation (N,) of each heading relative to the one it is best known to.
 
     ``covariance`` (D, D) is without the team's rotation.
     """
@@ -47,20 +45,22 @@ def unknown_headings(covariance: Floats, rows: npt.NDArray[np.int64]) -> npt.NDA
     own = covariance[np.ix_(place, place)]
     apart = own.diagonal()[:, None] + own.diagonal() - 2.0 * own
     np.fill_diagonal(apart, np.inf)
-    unknown: npt.NDArray[np.bool_] = apart.min(axis=1) > VAGUE_RAD**2
-    return unknown
+    sigmas: Floats = np.sqrt(np.maximum(apart.min(axis=1), 0.0))
+    return sigmas
 
 
 def open_sides(
     places_m: Complexes, weight: Floats, near: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Tell who (N,) of hypotheses (K, N) may be on either side of the line through two others.
+
+    And who is in such a line, where sides cannot be told apart.
 
     Looked at are the triangles of each and the two that are nearest to it, where their distances
     are known: ``near`` (N, N).
     """
     count = places_m.shape[1]
-    sides = np.zeros(count, dtype=np.bool_)
+    sides, in_line = np.zeros((2, count), dtype=np.bool_)
     middle = weight @ places_m
     apart_m = np.abs(middle[:, None] - middle)
     three = np.argsort(apart_m, axis=1, kind="stable")[:, :3]
@@ -75,11 +75,13 @@ def open_sides(
     on_right_m = weight @ np.minimum(height_m, 0.0) / np.maximum(right, 1e-9)
     between_m = on_left_m - on_right_m
     within_m2 = weight @ (height_m - np.where(is_left, on_left_m, on_right_m)) ** 2
-    is_open = np.minimum(left, right) > LEAST_WEIGHT
-    is_open &= near[three, three[:, before]].all(axis=1)
-    is_open &= between_m > np.maximum(2.0 * ASIDE_M, APART * np.sqrt(within_m2))
-    sides[three[is_open].ravel()] = True
-    return sides
+    is_near = near[three, three[:, before]].all(axis=1)
+    is_either = np.minimum(left, right) > LEAST_WEIGHT
+    is_apart = between_m > np.maximum(BETWEEN_M, APART * np.sqrt(within_m2))
+    is_low = np.abs(weight @ height_m) < ASIDE_M
+    sides[three[is_near & is_either & is_apart].ravel()] = True
+    in_line[three[is_near & (is_low | (is_either & ~is_apart))].ravel()] = True
+    return sides, in_line
 
 
 def mirror_image(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
@@ -114,8 +116,10 @@ def open_nodes(
     covariance: Floats,
     sigma_m: Floats,
     standing: Container[int],
-) -> tuple[set[int], dict[int, set[int]]]:
+) -> tuple[set[int], dict[int, set[int]], dict[int, float]]:
     """Return who is open, and of each located node those whose distance to it is known.
+
+    Then who is in a line with two others, and the deviation of its heading (rad).
 
     ``covariance`` (D, D) is without the team's rotation, ``sigma_m`` (P,) the deviations of the
     distances of every two nodes, in order. The heading of who is ``standing`` since it was found
@@ -123,21 +127,25 @@ def open_nodes(
     """
     nodes = sorted(row)
     if len(nodes) < 2:
-        return set(), {node: set() for node in nodes}
+        return set(), {node: set() for node in nodes}, {}
     rows = np.array([row[node] for node in nodes], dtype=np.int64)
     i, k = storage.every_pair(len(rows))
     near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
     near[i, k] = near[k, i] = sigma_m < VAGUE_PAIR_M
-    is_open = unknown_headings(covariance, rows) & [node not in standing for node in nodes]
-    if len(nodes) > 2 and these.count > 1:
+    sigmas_rad = heading_sigmas(covariance, rows)
+    is_open = (sigmas_rad > VAGUE_RAD) & [node not in standing for node in nodes]
+    in_line = np.zeros_like(is_open)
+    if len(nodes) > 2:
         weight = these.unperturbed_weights().reshape(-1)[: these.count]
         at = storage.POSE * rows
         east_m, north_m = (storage.of_each(these.arrays.x[:, at + e], these.count) for e in (0, 1))
-        is_open |= open_sides(east_m + 1j * north_m, weight, near)
+        sides, in_line = open_sides(east_m + 1j * north_m, weight, near)
+        is_open |= sides
     return (
         {n for n, o in zip(nodes, is_open.tolist(), strict=True) if o},
         {
             n: {m for m, known in zip(nodes, line, strict=True) if known}
             for n, line in zip(nodes, near.tolist(), strict=True)
         },
+        {nodes[k]: float(sigmas_rad[k]) for k in np.flatnonzero(in_line)},
     )
