@@ -47,7 +47,7 @@ class GaitDetector {
 // docs/deadreckoning.md. Under kSmallRise_m the rise is sway and bending as much as stepping.
 const float kSmallRise_m = 0.02f;
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain);
-// What turning leaves of a step's length: 1 straight ahead and in bends, a half at 1.15 rad a stride.
+// What turning leaves of a step's length: 1 straight ahead and in bends, half at kTurn_rad a stride.
 // Of a stride, because the trunk swings by up to 0.3 rad from step to step.
 float turning_share(float stride_rad);
 
