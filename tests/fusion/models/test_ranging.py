@@ -279,6 +279,27 @@ def test_how_outliers_go_on_is_learned(go_on: float, share: float) -> None:
     assert persistence.expected(200.0, [(1, 2)])[0, 0] == pytest.approx(go_on, abs=0.07)
 
 
+BLOCKED = [(20, 45, (1, 2)), (50, 75, (1, 3)), (90, 130, (1, 3)), (90, 130, (2, 3))]
+"""From when to when (s) which pair's ranges are too long."""
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_somebody_all_whose_links_are_blocked_at_once_is_not_believed_to_have_moved(
+    seed: int,
+) -> None:
+    measurements, priors, truth = team(130, seed)
+    blocked = [
+        replace(m, range_m=m.range_m + 2.0)
+        if isinstance(m, Range)
+        and any(a <= m.time_s < b and pair == (m.node, m.peer) for a, b, pair in BLOCKED)
+        else m
+        for m in measurements
+    ]
+    bank = fusion.make("bank", priors, {}, seed)
+    estimates = [e for m in blocked for e in bank.process(m)] + bank.finish()
+    assert distance_rmse([e for e in estimates if e.time_s >= 90], truth) < 0.5
+
+
 def test_an_outlier_says_less_with_time_and_nothing_of_other_pairs() -> None:
     persistence = OutlierPersistence()
     assert persistence.expected(0.0, [(1, 2)])[0, 0] == 0.0
