@@ -74,12 +74,11 @@ void inertial_counters(const DeadReckoning* reckoning, uint32_t* values) {
   const relpos::InertialCounters& c = reckoning->counters();
   values[0] = c.refused_samples;
   values[1] = c.saturated_samples;
-  values[2] = c.rejected_steps;
-  values[3] = c.doubtful_steps;
-  values[4] = c.rejected_magnetic;
-  values[5] = c.lost_steps;
-  values[6] = reckoning->filter().repairs();
-  values[7] = c.turned_sensors;
+  values[2] = c.doubtful_steps;
+  values[3] = c.rejected_magnetic;
+  values[4] = c.lost_steps;
+  values[5] = reckoning->filter().repairs();
+  values[6] = c.turned_sensors;
 }
 
 // P := F P F' + Q over one span, for the check of the Jacobian: matrix is kStates x kStates.

@@ -49,7 +49,6 @@ ROW = np.dtype(
 COUNTERS = (
     "refused_samples",
     "saturated_samples",
-    "rejected_steps",
     "doubtful_steps",
     "rejected_magnetic",
     "lost_steps",

@@ -9,6 +9,7 @@
 #ifndef RELPOS_NODE_ID
 #define RELPOS_NODE_ID 0
 #endif
+static_assert(RELPOS_NODE_ID >= 0 && RELPOS_NODE_ID <= 254, "RELPOS_NODE_ID: 1 to 254, or 0");
 
 namespace {
 

@@ -150,7 +150,7 @@ void DeadReckoning::reset() {
   static_assert(__is_standard_layout(DeadReckoning), "the configuration is at its start");
   const size_t kept = sizeof config_ + sizeof bias_rad_s_;
   memset(reinterpret_cast<uint8_t*>(this) + kept, 0, sizeof *this - kept);
-  displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
+  displacement_.quality_flags = kForwardUnknown;
   filter_.reset(kTiltMoving_rad * kTiltMoving_rad,
                 config_.gyro_bias_sigma_rad_s * config_.gyro_bias_sigma_rad_s,
                 kSpeedUnknown_m_s * kSpeedUnknown_m_s);
@@ -346,6 +346,8 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
 RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
+  // Samples are so far apart that the step before is still being worked off.
+  if (job_ > kIdle && job_ <= kCommit) commit_step();
   if (stance.last) {
     displacement_.last_step_length_m = closing_m_;
     ++displacement_.steps;
@@ -749,21 +751,12 @@ RELPOS_APART void DeadReckoning::publish() {
     add(&d.y_m, way[kY]);
   }
   d.moving = gait_.walking();
-  const uint16_t rejected = gait_.take_rejected();
-  if (rejected > 0) count(&counters_.rejected_steps);
   uint16_t flags = d.quality_flags & kMagneticDisturbed;
   if (hold_[kHoldAcceleration] > 0) flags |= kAccelerationSaturated;
   if (hold_[kHoldRate] > 0) flags |= kAngularRateSaturated;
   if (hold_[kHoldInput] > 0) flags |= kBadInput;
   if (hold_[kHoldDoubt] > 0) flags |= kStepDoubtful;
   if (!forward_.found()) flags |= kForwardUnknown;
-  if (quiet()) flags |= kStanding;
-  if (filter_.repairs() > 0) flags |= kCovarianceRepaired;
-  if (!d.initialised) flags |= kStarting;
-  if (!d.initialised ||
-      filter_.covariance(kBias + kZ, kBias + kZ) > (0.3f * kDegree) * (0.3f * kDegree)) {
-    flags |= kBiasUncertain;
-  }
   d.quality_flags = flags;
 }
 

@@ -41,7 +41,6 @@ struct InertialConfig {
 struct InertialCounters {
   uint16_t refused_samples;     // not finite, or dt outside (0, 0.2] s
   uint16_t saturated_samples;
-  uint16_t rejected_steps;      // arcs while walking that were no step
   uint16_t doubtful_steps;      // steps whose length contradicted the inertial motion
   uint16_t rejected_magnetic;
   uint16_t lost_steps;          // steps after which the velocity had to start anew

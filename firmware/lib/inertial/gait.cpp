@@ -62,12 +62,6 @@ RELPOS_SHARED void GaitDetector::restart_arc() {
 
 RELPOS_APART bool GaitDetector::walking() const { return since_s_ < kPause_s; }
 
-uint16_t GaitDetector::take_rejected() {
-  const uint16_t count = rejected_;
-  rejected_ = 0;
-  return count;
-}
-
 RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   if (!running_) {
     mean_m_s2_ = vertical_m_s2;
@@ -105,11 +99,7 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
                  range_m_s2 < kSmallestRange_m_s2;
   if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || periods < kDueFrom ||
                        periods > kDueUntil)) {
-    if (first) {
-      restart_arc();
-    } else if (rejected_ < 255) {
-      ++rejected_;
-    }
+    if (first) restart_arc();
     return false;
   }
   float excursion = swing;

@@ -28,7 +28,6 @@ class GaitDetector {
   float vertical_velocity_m_s() const { return velocity_m_s_; }
   float since_stance_s() const { return since_s_; }
   bool walking() const;  // a step within the pause time
-  uint16_t take_rejected();  // candidates refused since the last call
 
  private:
   void restart_arc();
@@ -36,7 +35,7 @@ class GaitDetector {
   float trough_m_, peak_m_;
   float lowest_m_s2_, minus_highest_m_s2_;
   float since_s_, period_s_;
-  uint8_t rejected_, steps_;  // steps of this walk, saturating
+  uint8_t steps_;  // steps of this walk, saturating
   bool running_, footfall_due_;
 };
 

@@ -34,6 +34,7 @@ class SampleClock {
   static constexpr uint32_t kNominalUs = 20000;
   static constexpr uint32_t kGapUs = 30000;  // longer: at least one sample is missing
 
+  void begin(uint32_t now_us) { last_us_ = now_us; }
   // A sample seen at now_us. Returns the time that it stands for.
   uint32_t step_us(uint32_t now_us) {
     const uint32_t gap_us = now_us - last_us_;
@@ -44,7 +45,7 @@ class SampleClock {
       started_ = true;
       block_start_us_ = now_us;
       block_samples_ = 0;
-      return first ? kNominalUs : gap_us;
+      return first && gap_us < kStartUs ? kNominalUs : gap_us;
     }
     if (++block_samples_ == kBlockSamples) {
       // Seen with up to 1 ms of jitter: 1e-4 of a block. Half of each block's news is taken.
@@ -59,6 +60,7 @@ class SampleClock {
 
  private:
   static constexpr uint16_t kBlockSamples = 512;  // 10 s
+  static constexpr uint32_t kStartUs = 1000000;   // setting the sensor up takes 0.25 s
 
   uint32_t last_us_;
   uint32_t block_start_us_;

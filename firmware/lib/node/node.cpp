@@ -75,6 +75,7 @@ constexpr uint8_t flag(wire::Quality quality) { return static_cast<uint8_t>(qual
 
 void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   clock_.begin(now_us);
+  sample_clock_.begin(now_us);
   imu_due_us_ = now_us;
   pozyx_due_us_ = now_us;
 
@@ -96,9 +97,11 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   for (uint8_t i = 0; i < kRebootBytes; ++i) reboot[i] = board_.storage_read(kStoredReboot + i);
   const uint8_t previous = board_.storage_read(kStoredBootCount);
   reset_cause_ = cause;
-  // Whatever cause the board tells (after a boot loader often none): it fits this one start.
+  // Whatever cause the board tells (after a boot loader often none): it fits this one start, and none
+  // 256 starts later.
   if (reboot[4] == previous && (reboot[5] ^ previous) == 0xFF) {
     reset_cause_ = wire::ResetCause::kCommand;
+    board_.storage_write(kStoredReboot + 5, previous);
     DoneCommand& done = commands_[0];
     done.token = static_cast<uint16_t>(reboot[0] | static_cast<uint16_t>(reboot[1]) << 8);
     done.key = static_cast<uint16_t>(reboot[2] | static_cast<uint16_t>(reboot[3]) << 8);
@@ -239,12 +242,13 @@ RELPOS_APART void Node::tick(uint32_t now_us) {
     return;  // the next sample's time shows the gap
   }
   uint32_t step_us = sample_clock_.step_us(now_us);
-  if (sampled_ && step_us > SampleClock::kGapUs) {
+  if (step_us > SampleClock::kGapUs) {
     const uint32_t missed = (step_us + SampleClock::kNominalUs / 2) / SampleClock::kNominalUs - 1;
     work_.missed_ticks = static_cast<uint16_t>(work_.missed_ticks + missed);
     quality_ |= flag(wire::Quality::kImuGap);
     if (step_us > kMostStepUs) {
-      totals_.rebase(dead_reckoning_.displacement(), static_cast<float>(step_us) * 1e-6f);
+      totals_.rebase(dead_reckoning_.displacement(),
+                     static_cast<float>(clock_.ms() - last_sample_ms_) * 1e-3f);
       dead_reckoning_.reset();
       quality_ |= flag(wire::Quality::kFilterReset);
       updates_ = 0;
@@ -380,12 +384,14 @@ RELPOS_APART void Node::receive_packet() {
     }
     return;
   }
+  // A record that a restart waits for is not changed while it is written.
+  if (!beacon && reboot_step_ != 0) return;
   *mark = header.counter;
   if (beacon) {
     wire::Beacon message;
     if (wire::decode(body, body_bytes, &message)) plan_.beacon(now_ms(), message, id_);
     pozyx_due_us_ = board_.now_us();
-  } else if (reboot_step_ == 0) {
+  } else {
     beacon_mark_ = 0;  // so a host whose beacons are refused brings them back
     obey(header, body, body_bytes);
     store_.save(Record::kMarks);  // before the answer, also to a repetition
@@ -519,6 +525,7 @@ wire::CommandResult Node::access_bus(uint8_t* bytes) {
 }
 
 RELPOS_APART void Node::report_raw(uint16_t reports) {
+  if (raw_reports_ == 0) lost_.dropped_ranges += ranges_.count();
   raw_reports_ = reports;
   raw_samples_ = raw_fields_ = 0;
   memset(&ranges_, 0, sizeof ranges_);  // and the sums
@@ -601,8 +608,8 @@ bool Node::radio_free() {
 // motion, where the radio's reports do not arrive and a frame takes 200 ms: every other frame at most.
 RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
-  const bool after_motion = settings_.report_period_ms <= kTransmitStatusMs &&
-                            frame_[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kMotion);
+  const bool after_motion =
+      frame_[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kMotion);
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
   } else if (!after_motion && period_over(&motion_ms_, settings_.report_period_ms)) {
@@ -613,7 +620,9 @@ RELPOS_APART bool Node::send_next() {
     send(wire::MessageType::kSteps, fill_steps(body));
   } else if (raw_reports_ != 0 && period_over(&raw_ms_, kRawPeriodMs)) {
     send(wire::MessageType::kSamples, fill_samples(body));
-  } else if (ranges_.count() >= wire::kMostRanges || (ranges_.count() > 0 && (plan_.resting() || !pozyx_.running()))) {
+  } else if (ranges_.count() >= wire::kMostRanges ||
+             (ranges_.count() > 0 &&
+              (plan_.resting() || !pozyx_.running() || settings_.ranging_period_ms == 0))) {
     send(wire::MessageType::kRanges, fill_ranges(body));
   } else if (period_over(&motion_ms_, settings_.report_period_ms)) {  // nothing else waits
     send(wire::MessageType::kMotion, fill_motion(body));

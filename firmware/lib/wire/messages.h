@@ -193,7 +193,7 @@ struct Status {
   uint16_t damaged_bytes;  // Bytes that arrived damaged at the UART: noise; wraps
   uint16_t lost_bytes;  // Bytes that the UART had no room for; wraps
   uint8_t ranging_error;  // Why the newest failed exchange failed: the Pozyx's code, or 128 no end, 129 bus, 130 refused without a code, 131 not a distance; 0: none has failed
-  uint8_t neighbours;  // Nodes ranged within the last 10 s
+  uint8_t neighbours;  // Nodes ranged within the last 8 to 16 s
   uint8_t team;  // Nodes in the beacon in force; 0: none is heard
   uint8_t health;  // What works
 };

@@ -306,7 +306,7 @@ STATUS = Message(
             "Why the newest failed exchange failed: the Pozyx's code, or 128 no end, "
             "129 bus, 130 refused without a code, 131 not a distance; 0: none has failed",
         ),
-        Quantity("neighbours", "u8", "Nodes ranged within the last 10 s"),
+        Quantity("neighbours", "u8", "Nodes ranged within the last 8 to 16 s"),
         Quantity("team", "u8", "Nodes in the beacon in force; 0: none is heard"),
         Quantity("health", "u8", "What works", values=Health),
     ),

@@ -72,6 +72,19 @@ TEST(the_turn_is_the_gyroscopes) {
   CHECK_NEAR(0.34906585f * 4.0f, d.heading_rad, 0.05f);
 }
 
+// A step's updates take six ticks, and the next step comes within five or six.
+TEST(steps_are_walked_with_ten_samples_a_second_too) {
+  const uint16_t steps = walk(8.0f).steps;
+  const float path_m = reckoning.displacement().path_m;
+  switch_on();
+  const float tick_s = 0.1f;
+  for (uint8_t tick = 0; tick < 80; ++tick) {
+    reckoning.update(sample_at(static_cast<float>(tick) * tick_s), tick_s);
+  }
+  CHECK(reckoning.displacement().steps + 1 >= steps);
+  CHECK(reckoning.displacement().path_m > 0.7f * path_m);
+}
+
 TEST(what_is_no_number_is_refused_and_counted) {
   walk(6.0f);
   const float x_m = reckoning.displacement().x_m;

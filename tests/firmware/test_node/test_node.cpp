@@ -846,6 +846,18 @@ TEST(motion_that_is_always_due_leaves_room_for_ranges_and_status) {
   CHECK(team.sent(wire::MessageType::kStatus) >= 2);
 }
 
+TEST(motion_that_is_due_a_little_after_every_frame_leaves_room_for_ranges_and_status) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetReportPeriodMs), 201);
+  team.run_ms(1500);
+  team.world.module_present = false;  // a frame takes a little over 200 ms
+  team.world.count = 0;
+  team.run_ms(30000);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 70);
+  CHECK(team.sent(wire::MessageType::kRanges) >= 10);
+  CHECK(team.sent(wire::MessageType::kStatus) >= 2);
+}
+
 TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
   Team team;
   team.world.command(1, code(wire::CommandCode::kSetTeamSize), 20);
@@ -990,6 +1002,38 @@ TEST(an_imu_that_was_away_gives_a_gap_a_reset_and_a_larger_variance) {
   CHECK(status.missed_ticks >= 140);
 }
 
+TEST(an_imu_that_comes_after_a_minute_is_charged_for_the_minute) {
+  Team team;
+  team.world.inertial_present = false;
+  team.run_ms(60000);
+  team.world.count = 0;
+  team.world.inertial_present = true;
+  team.run_ms(3000);
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK(motion.variance_along_mm2 >= 3600000000u);  // 1 m/s
+}
+
+TEST(an_imu_that_was_away_for_a_turn_of_the_microseconds_is_charged_for_it) {
+  Team team;
+  team.run_ms(6000);
+  team.world.inertial_present = false;
+  for (uint8_t minutes = 0; minutes < 71; ++minutes) {
+    team.world.count = 0;
+    team.run_ms(60000);
+  }
+  wire::Motion before;
+  CHECK(team.read(wire::MessageType::kMotion, &before));
+  team.world.count = 0;
+  team.run_ms(35500);  // 71.6 minutes are 2^32 us
+  team.world.inertial_present = true;
+  team.run_ms(3000);
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  // The most that is charged, a minute at 1 m/s.
+  CHECK(motion.variance_along_mm2 - before.variance_along_mm2 >= 3600000000u);
+}
+
 TEST(a_command_is_done_once_however_often_it_comes) {
   Team team;
   team.run_ms(500);
@@ -1132,6 +1176,53 @@ TEST(a_record_of_a_reboot_that_a_power_cut_left_unfinished_counts_for_nothing) {
   CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kBrownOut), status.reset_cause);
 }
 
+TEST(a_restart_that_was_commanded_is_told_once_and_not_256_starts_later) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);
+  team.run_ms(1000);
+  for (uint16_t start = 0; start <= 256; ++start) {
+    Node again(team.world);
+    team.world.count = 0;
+    again.begin(team.world.now, wire::ResetCause::kBrownOut, 0);
+    if (start > 0 && start < 256) continue;
+    team.run(again, 3000);
+    wire::Status status;
+    CHECK(team.read(wire::MessageType::kStatus, &status));
+    const wire::ResetCause cause =
+        start == 0 ? wire::ResetCause::kCommand : wire::ResetCause::kBrownOut;
+    CHECK_EQUAL(static_cast<uint8_t>(cause), status.reset_cause);
+  }
+}
+
+// As the host asks that has had no answer: twice, back to back.
+TEST(a_second_command_while_a_restart_waits_leaves_the_counters_whole) {
+  for (uint32_t apart_us = 500; apart_us < 20000; apart_us += 1500) {
+    Team team;
+    team.world.storage_us = 3400;
+    team.run_ms(1500);
+    ask(team, team.node, wire::CommandCode::kPing, 0);
+    team.world.command(7, code(wire::CommandCode::kReboot), 0);
+    const uint32_t start_us = team.world.now;
+    bool again = false;
+    while (team.world.restarts == 0) {
+      if (!again && team.world.now - start_us >= apart_us) {
+        again = true;
+        team.world.command(7, code(wire::CommandCode::kReboot), 0);
+      }
+      team.world.begin_poll();
+      team.node.poll(team.world.now);
+      team.world.now += 100;
+    }
+    const uint16_t copy_bytes = 11;
+    for (uint8_t copy = 0; copy < 2; ++copy) {
+      const uint8_t* stored = team.world.eeprom + relpos::kStoredRecords + copy * copy_bytes;
+      uint16_t crc;
+      memcpy(&crc, stored + copy_bytes - 2, 2);
+      CHECK_EQUAL(wire::crc16(stored + 1, copy_bytes - 3, 0xFFFF - stored[0]), crc);
+    }
+  }
+}
+
 TEST(a_uart_with_little_space_carries_the_same_frames) {
   Team team;
   team.world.line_bytes = 3;
@@ -1266,6 +1357,35 @@ TEST(a_node_that_reports_raw_samples_does_not_range_and_then_ranges_again) {
   CHECK(team.read(wire::MessageType::kRanges, &ranges));
   CHECK_EQUAL(5, ranges.count);
   for (uint8_t i = 0; i < 5; ++i) CHECK_EQUAL(1000u * ranges.entries[i].peer, ranges.entries[i].range_mm);
+}
+
+TEST(ranges_that_wait_when_ranging_ends_are_sent_or_counted) {
+  for (const bool raw : {false, true}) {
+    for (uint16_t moment_ms = 0; moment_ms < 2000; moment_ms += 100) {
+      Team team;
+      team.world.exchange_us = 20000;
+      team.run_ms(4000u + moment_ms);
+      if (raw) {
+        team.world.command(9, code(wire::CommandCode::kSetRawReports), 5);
+        team.run_ms(3000);
+      }
+      team.world.command(10, code(wire::CommandCode::kSetRangingPeriodMs), 0);
+      team.run_ms(1500);
+      team.world.command(11, code(wire::CommandCode::kSetStatusPeriodMs), 1000);
+      team.run_ms(2500);
+      uint16_t sent = 0;
+      wire::Ranges ranges;
+      for (uint16_t i = 0; i < team.world.count; ++i) {
+        const Sent& frame = team.world.frames[i];
+        if (frame.header.type != wire::MessageType::kRanges) continue;
+        CHECK(wire::decode(frame.body, frame.length, &ranges));
+        sent = static_cast<uint16_t>(sent + ranges.count);
+      }
+      wire::Status status;
+      CHECK(team.read(wire::MessageType::kStatus, &status));
+      CHECK_EQUAL(status.ranging_successes, sent + status.dropped_ranges);
+    }
+  }
 }
 
 TEST(a_calibration_is_in_force_after_its_commit_and_not_a_word_earlier) {
