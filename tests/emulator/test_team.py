@@ -6,15 +6,18 @@ import math
 import threading
 from collections import Counter
 
+import numpy as np
 import pytest
 
+from relpos import fusion
 from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.serving import record_team, serve_team
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError, RelposError
+from relpos.fusion.estimator import NodeStatus
 from relpos.link.port import Link, observe, open_port
 from relpos.link.xbee import Parser, Receive16
-from relpos.measurements import Motion, Range, Status
+from relpos.measurements import Height, Motion, Range, Status
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
@@ -255,3 +258,27 @@ def test_a_terminal_of_a_real_team_gives_its_bytes_whole():
             got += port.read(max(1, port.in_waiting))
         terminal.join()
     assert got == expected
+
+
+def test_whose_inertial_sensor_is_silent_is_followed_by_ranges_and_not_believed_to_stand():
+    off = "imu:off:node=2,from=25,to=55"
+    with EmulatedTeam(TeamConfig("paper", 4, 65.0, 2, faults=(off,))) as team:
+        link, received = Link(), []
+        for time_us, data in team.stream():
+            received += link.feed(data, time_us * 1e-6)
+        estimator = fusion.make("bank", team.priors(), {}, 1)
+        used = [one for one in received if isinstance(one, Motion | Range | Height)]
+        estimates = [e for one in used for e in estimator.process(one)]
+        off_m, sigma_m, ok = [], [], []
+        for estimate in [*estimates, *estimator.finish()]:
+            good = {n.node for n in estimate.nodes if n.status is NodeStatus.OK}
+            for pair in estimate.pairs:
+                if estimate.time_s > 25.0 and 2 in (pair.node, pair.peer):
+                    a, b = (team.position_m(n, estimate.time_s) for n in (pair.node, pair.peer))
+                    off_m.append(abs(pair.distance_m - math.dist(a[:2], b[:2])))
+                    sigma_m.append(pair.sigma_distance_m)
+                    ok.append({pair.node, pair.peer} <= good)
+    off_m, sigma_m, ok = np.array(off_m), np.array(sigma_m), np.array(ok)
+    assert ok.any()
+    assert (off_m[ok] < 3.0 * sigma_m[ok]).all()
+    assert np.sqrt((off_m**2).mean()) < 1.0

@@ -312,6 +312,24 @@ def test_variances_across_add_up_as_they_are_reported():
     assert motion.sigma_y_m == pytest.approx(0.3, abs=1e-3)
 
 
+def test_a_silent_inertial_sensor_tells_no_motion_and_then_all_of_it_at_once():
+    silent = {"state": wire.MotionState.STARTING, "quality": wire.Quality.IMU_GAP}
+    moving = {"state": wire.MotionState.MOVING, "quality": 0}
+    decoder, got = Decoder(), []
+    frames = [
+        {"time_s": 1.0, "x_m": 1.0, **moving},
+        {"time_s": 2.0, "x_m": 1.0, **silent},
+        {"time_s": 3.0, "x_m": 1.0, **silent | {"quality": 0x10 | wire.Quality.HEIGHT_VALID}},
+        {"time_s": 4.0, "x_m": 1.5, "variance_along_m2": 9.0, **moving},
+    ]
+    for counter, values in enumerate(frames):
+        got.append(decoder.feed(motion_frame(counter, **values), values["time_s"]))
+    assert [len(motions(each)) for each in got] == [1, 0, 0, 1]
+    assert [type(one) for one in got[2]] == [Height]
+    (last,) = motions(got[3])
+    assert (last.dx_m, last.sigma_x_m) == pytest.approx((0.5, 3.0))
+
+
 def test_an_error_of_scale_is_one_from_the_start_and_its_square_grows_with_it():
     decoder = Decoder()
     decoder.feed(motion_frame(0, time_s=1, scale_error_m=0.3), 1.0)

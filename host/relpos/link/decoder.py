@@ -402,9 +402,14 @@ class Decoder:
         cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
         dx_m, dy_m = total("x_m"), total("y_m")
         quality = wire.Quality(values["quality"])
+        # Its totals stand still while the inertial sensor is silent: they tell no motion, and come,
+        # with the variance of the gap, once it is back.
+        silent = bool(quality & wire.Quality.IMU_GAP) and (
+            values["state"] == wire.MotionState.STARTING
+        )
         along_m2 = max(total("variance_along_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
         scale_m = total("scale_error_m")
-        observations: list[Observation] = [
+        moved = [
             Motion(
                 time_s,
                 node,
@@ -424,6 +429,7 @@ class Decoder:
                 round(total("steps")),
             )
         ]
+        observations: list[Observation] = [] if silent else [*moved]
         if quality & wire.Quality.HEIGHT_VALID:
             track.height_m = track.restart_height_m + values["height_m"]
             observations.append(Height(time_s, node, track.height_m))
@@ -438,9 +444,9 @@ class Decoder:
                     "magnetic",
                 )
             )
-        track.totals = dict(values)
         track.motion_s = time_s
-        track.unseen_s = 0.0
+        if not silent:
+            track.totals, track.unseen_s = dict(values), 0.0
         return observations
 
     def _link_status(self, node: int, track: NodeTrack, time_s: float) -> list[Observation]:
