@@ -355,6 +355,33 @@ def test_nobody_at_the_command_post_is_called_or_ordered_out():
     assert [person.name for person in album.views[-1].people][2] == "Command post"
 
 
+@pytest.mark.parametrize("kind", ["mayday", "marker", "name"])
+def test_a_request_is_taken_as_the_kind_that_its_device_was_allowed(kind):
+    order = {"kind": "evacuate", "action": "order", "nodes": [1, 2], "on": True}
+    body = {"mayday": {}, "marker": {"x_m": 0.0, "y_m": 0.0}, "name": {"name": "Kim"}}[kind]
+    with EmulatedTeam(TeamConfig("straight", 2, 14.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        phones = Phones(source, (10.0, Request(1, kind, 10.0, {**order, **body, "node": 1})))
+        session, _ = make_session(source, deadreckoning, phones)
+        run_through(session)
+    assert phones.answers
+    assert not getattr(phones, "board", {}).get("evacuation")
+
+
+def test_a_port_that_vanishes_is_told_where_nothing_is_shown(tmp_path):
+    remarks = []
+    with EmulatedTeam(TeamConfig("straight", 2, 12.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        source.trouble = lambda: "/dev/x: gone" if source.now_s() > 6.0 else None
+        plan = SessionPlan(
+            "walk", tmp_path, Description(), deadreckoning, "deadreckoning", priors=team.priors()
+        )
+        run_session(source, plan, [lambda _: Album()], remark=remarks.append)
+    assert [line for line in remarks if "gone" in line] == [
+        "/dev/x: gone; trying again each second"
+    ]
+
+
 def test_a_recording_is_played_and_takes_no_presses():
     motions = [Motion(float(t), node, 1.0, 0.0, 0.1) for t in range(1, 30) for node in (1, 2)]
     source = PacedInput("a run", [Received(m.time_s, b"", (m,)) for m in motions], speed=0.0)

@@ -278,6 +278,18 @@ def test_a_port_that_vanishes_is_reported_in_one_line_and_the_data_is_kept(
     assert (tmp_path / "estimate.csv").stat().st_size > 1000
 
 
+def test_a_port_is_not_fused_into_the_folder_of_an_earlier_session(tmp_path, team_bytes, port):
+    listen_until_it_vanishes(port, team_bytes, tmp_path / "out")
+    kept = (tmp_path / "out" / "received" / "motion.csv").read_bytes()
+    again = Port()
+    words = ["fuse", again.path, "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(main.app, words)
+    again.vanish()
+    assert done.exit_code == 1
+    assert "holds what an earlier session received" in done.stderr
+    assert (tmp_path / "out" / "received" / "motion.csv").read_bytes() == kept
+
+
 def test_an_interrupt_ends_a_session_and_keeps_what_came(tmp_path, team_bytes, port):
     process = start("fuse", port.path, "--initial", "common", "--out", tmp_path)
     try:

@@ -411,11 +411,16 @@ def _fuse_port(
     from relpos.link.port import check_port
     from relpos.measurements import common_priors
     from relpos.runs import Description
+    from relpos.runs.run import RECEIVED, TABLE_NAMES
+    from relpos.runs.table import find_table
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
     team_key(key_file)  # for its errors, before minutes of preparing
+    received = job.out / RECEIVED
+    if any(find_table(received, name) for name in TABLE_NAMES):
+        raise DataError(f"{received}: holds what an earlier session received: choose another --out")
     # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
     # place are received later; two stand for them here.
     some = common_priors((1, 2))
@@ -499,17 +504,18 @@ def _debrief(job: Job, options: live.Options) -> None:
     from relpos.evaluation import report as reports
     from relpos.evaluation.result import read_result
     from relpos.runs.log import read_log
+    from relpos.runs.run import RECEIVED
 
     page = job.out / "index.html"
     try:
         with output.working("writing the debrief (Ctrl-C: not now)"):
-            run, result = api.load(job.out / "received"), read_result(job.out)
+            run, result = api.load(job.out / RECEIVED), read_result(job.out)
             reports.write(reports.gather(run, result, log=read_log(job.out)), page)
     except RelposError as error:
         output.remark(f"no debrief page: {error}")
         return
     except KeyboardInterrupt:
-        output.remark(f"for the debrief: relpos report {job.out / 'received'} --estimate {job.out}")
+        output.remark(f"for the debrief: relpos report {job.out / RECEIVED} --estimate {job.out}")
         return
     output.remark(f"debrief: {page}")
     live.open_browser(options, page.resolve().as_uri())

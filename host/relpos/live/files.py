@@ -13,6 +13,7 @@ from relpos.measurements import Observation, Step
 from relpos.runs import Description, EstimateFiles, RunFiles, drop_page
 from relpos.runs.appending import AppendedTable
 from relpos.runs.log import LOG_COLUMNS, LOG_FILE
+from relpos.runs.run import RECEIVED
 from relpos.said import Said
 
 
@@ -29,7 +30,7 @@ class FileSink(Sink):
         drop_page(directory)
         self._estimates = EstimateFiles(directory)
         self._log = AppendedTable(directory / LOG_FILE, LOG_COLUMNS, wanted=False)
-        self._received = RunFiles(directory / "received", description) if keep_received else None
+        self._received = RunFiles(directory / RECEIVED, description) if keep_received else None
         self._undescribed: OSError | None = None
         """Why the newest names are not in run.toml yet."""
 

@@ -254,8 +254,6 @@ class LiveSession:
                 what=what,
                 error=repr(error),
             )
-            if self._failed[f"{what}s_failed"] == 1:
-                self._remark(text)
             self.post(what, Level.ALARM, text)
             self._notices.expire(what)
 
@@ -387,6 +385,9 @@ class LiveSession:
             self._changed = True
             if text is not None:
                 self.log("note" if level is Level.INFO else str(level), text)
+                # Where nothing is shown, the terminal is all that tells it.
+                if level is not Level.INFO:
+                    self._remark(text)
 
     # -- the log ----------------------------------------------------------------------------------
 
@@ -450,7 +451,7 @@ class LiveSession:
         body = request.body
         if request.kind in EVENTS:
             node, by = body.get("node"), body.get("by", "")
-            done = self._happen({"kind": request.kind, **body})
+            done = self._happen({**body, "kind": request.kind})
             if done and request.kind in LOGGED:
                 self.log(request.kind, self._words(request.kind, body), node, by)
             return {"acknowledged": done} if request.kind == "acknowledge" else body, 200
@@ -496,7 +497,7 @@ class LiveSession:
                 return refusal(Said("where", "where you are is not known yet")), 409
             body |= {"x_m": at.x_m, "y_m": at.y_m}
         try:
-            self._happen({"kind": kind, **body})
+            self._happen({**body, "kind": kind})
         except BoardError as error:
             return refusal(error.args[0]), 400
         if kind == "mayday" and body.get("on"):

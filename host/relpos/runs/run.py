@@ -417,6 +417,9 @@ _TABLES = (
     _Table("steps.csv", Step),
     _Table("truth.csv", Truth),
 )
+RECEIVED = "received"
+"""Folder of a session with the run that it received."""
+
 TABLE_NAMES = (*(table.name for table in _TABLES), "imu.csv", "landmarks.csv")
 """The tables of a run directory: a folder that has one of them holds a run."""
 
