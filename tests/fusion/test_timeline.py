@@ -222,11 +222,14 @@ def rounds(count: int) -> list[Measurement]:
 
 def test_taking_in_gives_the_steps_of_pushing_and_says_when_there_are_any() -> None:
     taking, pushing = (Timeline((1, 2), 0.75, keep_late=True) for _ in range(2))
+    said = set()
     for measurement in rounds(6):
         certain = taking.take_in(measurement)
         steps = list(taking.push_all(()))
         assert steps == pushing.push(measurement)
         assert certain or not steps
+        said.add(certain)
+    assert said == {False, True}
     assert taking.finish() == pushing.finish()
     assert not taking.late, "what comes in order is called late"
 

@@ -150,6 +150,7 @@ def test_no_member_is_sent_twice_a_second(schedule: Schedule) -> None:
         changes: dict[int, Any] = {3: {"alert": Alert.STILL_ALARM}} if 20 < tick < 40 else {}
         for uid in due(schedule, team_view(tick, changes=changes), now_s):
             times.setdefault(uid.removesuffix("-9-1-1"), []).append(now_s)
+    assert {"test.1", "test.2", "test.3"} <= set(times)
     for sent_s in times.values():
         assert min(np.diff(sent_s)) >= 1.0 - 1e-9
         assert len(sent_s) >= 5

@@ -116,7 +116,9 @@ def test_the_team_is_drawn_where_it_was_estimated(recorded):
 
 
 def test_messages_have_their_arrival_time_and_their_measurement_time(recorded):
-    for topic, _, message, decoded in messages(recorded):
+    found = messages(recorded)
+    assert {topic for topic, *_ in found} >= {"/serial", "/event"}
+    for topic, _, message, decoded in found:
         if topic == "/serial":
             assert message.log_time == START_NS + round(decoded["arrival_s"] * 1e9)
         if topic == "/event":
