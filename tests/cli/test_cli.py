@@ -92,6 +92,15 @@ def test_usage_puts_what_may_be_left_out_in_one_pair_of_brackets(command, argume
     assert usage.strip().lower().endswith(arguments)
 
 
+@pytest.mark.parametrize("command", ["fuse", "mission", "demo", "emulate"])
+def test_help_names_one_default_of_an_option(command: str) -> None:
+    options = relpos(command, "--help").stdout.split("--")
+    told, shown = ({x for x in options if f"{bracket}default: " in x} for bracket in "([")
+    assert told
+    assert shown
+    assert not told & shown
+
+
 def test_help_does_not_wait_for_numerical_libraries() -> None:
     program = (
         "import sys\nfrom typer.testing import CliRunner\nfrom relpos.cli import main\n"

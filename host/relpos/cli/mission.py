@@ -45,7 +45,9 @@ def mission(
     ] = Initial.UNKNOWN,
     estimator: EstimatorName = BANK,
     post: live.Post = None,
-    view_listen: live.ViewListen = "0.0.0.0",
+    view_listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Address of the page; 127.0.0.1: here alone.")
+    ] = "0.0.0.0",
     https: live.Https = False,
     open_browser: live.OpenBrowser = None,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many.")] = None,
@@ -82,7 +84,7 @@ def mission(
         before = found.about.port
         # The page's server outlives a session that was killed, for a moment.
         patience_s = 0.0 if before is None else PATIENCE_S
-        door, access = listen(view_listen or "0.0.0.0", before or DEFAULT_PORT, patience_s)
+        door, access = listen(view_listen, before or DEFAULT_PORT, patience_s)
         with door:
             if before not in (None, access.port):
                 output.remark(f"the page was at port {before}: devices open its new address")
@@ -259,7 +261,7 @@ def _earlier(
     link.decoder.expect_after(counters)
 
 
-def _print_invitation(found: Mission, role: str, view_listen: str | None) -> None:
+def _print_invitation(found: Mission, role: str, view_listen: str) -> None:
     from relpos.errors import RelposError
     from relpos.live.addresses import parse_listen
     from relpos.view import access as doors
@@ -269,7 +271,7 @@ def _print_invitation(found: Mission, role: str, view_listen: str | None) -> Non
         raise RelposError(f"--invite {role}: none of {', '.join(Role)}")
     if found.about.port is None:
         raise RelposError(f"{found.path}: no session has run yet")
-    host, _ = parse_listen(view_listen or "0.0.0.0")
+    host, _ = parse_listen(view_listen)
     door = doors.Access(found.about.port, doors.hosts_of(host), key=found.key)
     url = door.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
     # This process has no certificate; the one that serves the page may.
