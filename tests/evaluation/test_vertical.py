@@ -154,14 +154,15 @@ def test_a_truth_without_heights_is_not_scored() -> None:
 
 def test_a_building_is_scored_by_evaluate() -> None:
     run = relpos.simulate("building", 4, seconds=200)
-    score = relpos.evaluate(relpos.fuse(run, estimator="deadreckoning"), run)
+    result = relpos.fuse(run, estimator="deadreckoning")
+    score = relpos.evaluate(result, run)
     numbers = score.as_json()["vertical"]
     assert 0.0 < numbers["relative_rmse_m"] < 1.0
     assert numbers["floor_by_height"] > 0.9
     assert 1.7 < numbers["stairs_way"] < 2.3
     assert numbers["floor_right"] is None
     assert "vertical error" in str(score)
-    figure = relpos.plot(relpos.fuse(run, estimator="deadreckoning"), run, "section")
+    figure = relpos.plot(result, run, "section")
     (axes,) = figure.axes
     assert [text.get_text() for text in axes.texts] == [f"floor {k}" for k in range(4)]
     assert {line.get_label() for line in axes.lines} >= {
