@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,11 @@ from relpos import fusion, settings, tracks
 from relpos.errors import RelposError
 from relpos.evaluation import metrics
 from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.estimator_settings import BankSettings
+from relpos.fusion.switching import SwitchingEstimator
+from relpos.measurements import Motion, Range
 from relpos.simulation.paper import simulate_paper
 
 
@@ -100,3 +105,20 @@ def test_a_setting_that_is_none_any_more_is_told_once_and_left_out(
     (told,) = caplog.messages
     assert told == "bank: jump_m is no setting any more, and left out; it is 3"
     assert "jump_m" not in {info.key for info in fusion.settings_of("bank")}
+
+
+def test_ranges_of_nodes_that_are_sought_do_not_end_rounds_of_those_that_are_located() -> None:
+    run = simulate_paper("paper", 3)
+    estimator = SwitchingEstimator([p for p in run.priors if p.node < 3])
+    turn = 0
+    for m in run.measurements:
+        if m.time_s > 20.0:
+            break
+        if isinstance(m, Range):
+            turn += 1
+            estimator.process(replace(m, time_s=m.time_s + 0.001 * (turn % 500)))
+        elif isinstance(m, Motion):
+            estimator.process(m)
+    core = estimator.estimator.core
+    assert isinstance(core, Bank)
+    assert core.detection.rounds._turns == 1.0

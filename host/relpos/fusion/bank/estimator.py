@@ -269,32 +269,32 @@ class Bank:
             # A search may be long; finding no pose in it is no fault of the data.
             self._ranges_used += len(step.ranges)
             ranges = [r for r in step.ranges if r.node in located and r.peer in located]
+        if ranges:
+            self._use_ranges(step, ranges, timeline)
+        self._end_instant(time_s)
+
+    def _use_ranges(self, step: Ranging, ranges: Sequence[Range], timeline: Timeline) -> None:
+        """Update with those ``ranges`` of an instant that are between located nodes."""
+        time_s, ends, known = step.time_s, nodes_of(step.ranges), self._known
         measured = np.array([r.range_m for r in ranges])
         pairs = [(r.node, r.peer) for r in ranges]
         first, second, dz, variance = self._pairs(pairs)
-        if ranges:
-            self.core.relocalisation.relocalise_lost(time_s, first, second, measured)
+        self.core.relocalisation.relocalise_lost(time_s, first, second, measured)
         rounds = self._attempts(time_s, ranges, timeline)
-        if ranges:
-            repeats = self._repeats(pairs)
-            known = self._known
-            velocity = [
-                known[a].velocity_at(time_s) + known[b].velocity_at(time_s) for a, b in pairs
-            ]
-            outliers = self.outliers.expected(time_s, pairs)
-            before = self._unseen(ends, time_s)
-            inlier, excess_m = self.core.update(
-                first, second, measured, dz, variance, repeats, np.array(velocity), outliers
-            )
-            self.outliers.learn(time_s, pairs, inlier, excess_m)
-            self._ranges_used += len(ranges)
-            for (walk, place, spread), (_, moved, left) in zip(
-                before, self._unseen(ends, time_s), strict=True
-            ):
-                walk.correct(moved - place, spread, left)
+        repeats = self._repeats(pairs)
+        velocity = [known[a].velocity_at(time_s) + known[b].velocity_at(time_s) for a, b in pairs]
+        outliers = self.outliers.expected(time_s, pairs)
+        before = self._unseen(ends, time_s)
+        inlier, excess_m = self.core.update(
+            first, second, measured, dz, variance, repeats, np.array(velocity), outliers
+        )
+        self.outliers.learn(time_s, pairs, inlier, excess_m)
+        self._ranges_used += len(ranges)
+        after = self._unseen(ends, time_s)
+        for (walk, place, spread), (_, moved, left) in zip(before, after, strict=True):
+            walk.correct(moved - place, spread, left)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
-        self._end_instant(time_s)
 
     def _end_instant(self, time_s: float) -> None:
         faulty = [node for node, row in self._row.items() if row == self.core.faulty_row]
