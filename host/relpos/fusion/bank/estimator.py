@@ -54,6 +54,7 @@ from relpos.fusion.models.ranging import (
     deviations_within,
     slab_variance,
     slant_height,
+    tag_height_m,
 )
 from relpos.fusion.models.unseen_walk import UnseenWalk
 from relpos.fusion.post import posts_of
@@ -69,14 +70,6 @@ SET_OFF_M = 0.3
 
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading without a reported sigma: magnetic ones indoors are 10 degrees off."""
-
-
-@dataclass(slots=True)
-class _Known(Presence):
-    """What is kept of a node beside its hypotheses."""
-
-    worn_m: float = 0.0
-    """Height of the tag over the floor at the start."""
 
 
 @dataclass(slots=True)
@@ -103,7 +96,7 @@ class Bank:
     handedness: Handedness = field(default_factory=Handedness)
     turn_agreement: TurnAgreement = field(default_factory=TurnAgreement)
     _row: dict[int, int] = field(default_factory=dict)
-    _known: dict[int, _Known] = field(default_factory=dict)
+    _known: dict[int, Presence] = field(default_factory=dict)
     _standing: dict[int, Way] = field(default_factory=dict)
     """Located nodes without a heading: what they have gone since."""
     _pending: list[Advance] = field(default_factory=list)
@@ -180,15 +173,13 @@ class Bank:
             return 1e-3 + 1e-9 * self.core.hypotheses.covariance_entries + self.initialiser.cost_s()
         return 3e-5
 
-    def _meet(self, node: int) -> _Known:
+    def _meet(self, node: int) -> Presence:
         known = self._known.get(node)
         if known is None:
-            known = self._known[node] = _Known()
+            known = self._known[node] = Presence(Vertical(tag_height_m(self.mounting, node)))
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
-                known.worn_m = worn.height_m
                 self.core.hypotheses.biases.know_heights()
-                known.vertical = Vertical(worn.height_m)
         return known
 
     def _advance(self) -> None:
@@ -235,10 +226,7 @@ class Bank:
                 self._make(rows, moves, reported, slice(begin, k))
                 self._move_doubtful(rows, moves, reported, k)
                 begin = k + 1
-        if begin:
-            self._make(rows, moves, reported, slice(begin, len(steps)))
-        else:
-            self.core.move(rows, moves, reported)
+        self._make(rows, moves, reported, slice(begin, len(steps)))
 
     def _move_doubtful(self, rows: Indices, moves: Floats, reported: Floats | None, k: int) -> None:
         """Make displacement ``k``, which is far out of its node's habit, in half the hypotheses."""
@@ -328,8 +316,8 @@ class Bank:
                 moves = np.array([[back.dx_m, back.dy_m, 0.0, 0.0]])
                 self.core.move(np.array([row]), moves, np.array([reported_sigmas(back)]))
         for node, known in self._known.items():
-            vertical = self.vertical.of(node, time_s)
-            known.vertical = vertical._replace(z_m=known.worn_m + vertical.z_m)
+            vertical, tag_m = self.vertical.of(node, time_s), tag_height_m(self.mounting, node)
+            known.vertical = vertical._replace(z_m=tag_m + vertical.z_m)
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to.
