@@ -113,11 +113,11 @@ class Particles:
     """The paper's filter: 3 states a particle, M particles for each user."""
 
     def __init__(self, case: Case, seed: int, size: int, alpha: float) -> None:
-        from relpos.fusion.models.ranging import RangeNoise
+        from relpos.fusion.estimator_settings import ParticleSettings
         from relpos.fusion.particle.particle_set import ParticleSet
 
-        noise = RangeNoise(particle_sigma(case))
-        self.particles = ParticleSet(size, alpha, noise, np.random.default_rng(seed))
+        settings = ParticleSettings(size, alpha, particle_sigma(case))
+        self.particles = ParticleSet(settings, np.random.default_rng(seed))
         for pose in case.truth[0]:
             self.particles.add(np.repeat(pose[:, None], size, axis=1))
         self.rows = np.arange(case.nodes)

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.models.ranging import RangeNoise
+from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.particle.kernels import (
     DUAL_DRAWS,
     FAR_OUT,
@@ -19,6 +19,7 @@ from relpos.fusion.particle.kernels import (
     MIN_BANDWIDTH_M,
     NodeRanges,
 )
+from relpos.fusion.particle.particle_set import flat_over_peak
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -34,14 +35,14 @@ def move(poses: Floats, displacement: Floats) -> None:
 
 
 def log_likelihood(
-    measured_m: Floats, dx_m: Floats, dy_m: Floats, dz_m: Floats, noise: RangeNoise
+    measured_m: Floats, dx_m: Floats, dy_m: Floats, dz_m: Floats, noise: ParticleSettings
 ) -> Floats:
     """Eq. (6) as a logarithm, up to a constant; with outliers the mixture's."""
     predicted_m = np.sqrt(dx_m**2 + dy_m**2 + dz_m**2)
     exponent: Floats = -0.5 * ((measured_m - predicted_m) / noise.sigma_r_m) ** 2
     if noise.outliers <= 0.0:
         return exponent
-    mixed: Floats = np.logaddexp(exponent, math.log(noise.flat_over_peak))
+    mixed: Floats = np.logaddexp(exponent, math.log(flat_over_peak(noise)))
     return mixed
 
 
@@ -72,7 +73,7 @@ def moments(poses: Floats, weights: Floats) -> Floats:
     return np.column_stack([mean, spread[:, 0, 0], spread[:, 1, 1], spread[:, 0, 1], direction])
 
 
-def correct(poses: Floats, weights: Floats, ranges: NodeRanges, noise: RangeNoise) -> Floats:
+def correct(poses: Floats, weights: Floats, ranges: NodeRanges, noise: ParticleSettings) -> Floats:
     """Eq. (6) for all nodes: the product of the ranges' likelihoods, normalised."""
     centres, offset, peer, range_m, height_m = ranges
     result = weights.copy()
@@ -108,7 +109,7 @@ def dual_step(
     predicted: Floats,
     corrected: Floats,
     ranges: NodeRanges,
-    noise: RangeNoise,
+    noise: ParticleSettings,
     alpha: float,
     uniforms: Floats,
 ) -> None:

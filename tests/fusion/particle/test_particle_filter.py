@@ -10,10 +10,10 @@ import pytest
 from relpos import fusion
 from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.models.motion import MotionNoise
-from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle import kernels
-from relpos.fusion.particle.particle_set import ParticleSet
+from relpos.fusion.particle.particle_set import ParticleSet, flat_over_peak
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
@@ -31,10 +31,10 @@ def ranges_of(edges: list[tuple[int, float, float, float]], rows: int) -> kernel
 
 
 def corrected(
-    ranges: kernels.NodeRanges, poses: np.ndarray, weights: np.ndarray, noise: RangeNoise
+    ranges: kernels.NodeRanges, poses: np.ndarray, weights: np.ndarray, noise: ParticleSettings
 ) -> np.ndarray:
     result = np.empty_like(weights)
-    kernels.correct(poses, weights, ranges, noise.sigma_r_m, noise.flat_over_peak, result)
+    kernels.correct(poses, weights, ranges, noise.sigma_r_m, flat_over_peak(noise), result)
     return result
 
 
@@ -57,7 +57,7 @@ def test_weights_are_the_product_of_the_ranges_gaussian_densities() -> None:
     rng = np.random.default_rng(1)
     poses, weights = particles(rng, 3, 20)
     edges = [(2, 4.0, 1.0, 3.5), (0, -2.0, 2.0, 1.0), (2, 0.0, 5.0, 6.0), (0, 3.0, 3.0, 4.2)]
-    new = corrected(ranges_of(edges, 3), poses, weights, RangeNoise(0.8))
+    new = corrected(ranges_of(edges, 3), poses, weights, ParticleSettings(sigma_r_m=0.8))
     for user in (0, 2):
         direct = [
             weights[user, k]
@@ -76,7 +76,9 @@ def test_weights_are_the_product_of_the_ranges_gaussian_densities() -> None:
 def test_ranges_no_particle_can_explain_leave_finite_weights() -> None:
     rng = np.random.default_rng(2)
     poses, weights = particles(rng, 1, 30)
-    new = corrected(ranges_of([(0, 0.0, 0.0, 1e4)], 1), poses, weights, RangeNoise(0.01))
+    new = corrected(
+        ranges_of([(0, 0.0, 0.0, 1e4)], 1), poses, weights, ParticleSettings(sigma_r_m=0.01)
+    )
     assert new.sum() == pytest.approx(1.0)
 
 
@@ -84,7 +86,7 @@ def test_ranges_no_particle_can_explain_leave_finite_weights() -> None:
 def test_weights_stay_weights_where_the_dual_step_replaces_all_that_had_any(rest: float) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        team = ParticleSet(4, 0.5, RangeNoise(0.1, 0.0), rng)
+        team = ParticleSet(ParticleSettings(4, 0.5, 0.1), rng)
         for _ in range(2):
             team.add(np.zeros((3, 4)))
         team.weights[:] = rest
@@ -108,8 +110,8 @@ def test_an_outlier_share_bounds_what_one_range_can_do() -> None:
     poses[0, 0] = (1.0, 9.0)
     weights = np.array([[0.99, 0.01]])
     ranges = ranges_of([(0, 0.0, 0.0, 9.0)], 1)
-    gaussian = corrected(ranges, poses, weights, RangeNoise(0.3))
-    robust = corrected(ranges, poses, weights, RangeNoise(0.3, outliers=0.5))
+    gaussian = corrected(ranges, poses, weights, ParticleSettings(sigma_r_m=0.3))
+    robust = corrected(ranges, poses, weights, ParticleSettings(sigma_r_m=0.3, outliers=0.5))
     assert gaussian[0, 0] < 1e-9 < 0.5 < robust[0, 0]
 
 
@@ -237,8 +239,8 @@ def test_the_order_of_ranges_does_not_matter() -> None:
     rng = np.random.default_rng(8)
     poses, weights = particles(rng, 3, 50)
     edges = [(0, 1.0, 2.0, 2.0), (1, 0.0, 0.0, 1.5), (2, 3.0, 1.0, 2.5), (0, 0.0, 0.0, 1.0)]
-    forward = corrected(ranges_of(edges, 3), poses, weights, RangeNoise(1.0))
-    backward = corrected(ranges_of(edges[::-1], 3), poses, weights, RangeNoise(1.0))
+    forward = corrected(ranges_of(edges, 3), poses, weights, ParticleSettings(sigma_r_m=1.0))
+    backward = corrected(ranges_of(edges[::-1], 3), poses, weights, ParticleSettings(sigma_r_m=1.0))
     assert forward == pytest.approx(backward, rel=1e-12)
 
 

@@ -11,9 +11,9 @@ import pytest
 from reference import particle as reference
 from relpos.fusion import vectormath
 from relpos.fusion.compiled import compiled
-from relpos.fusion.models.ranging import RangeNoise
+from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.particle import kernels
-from relpos.fusion.particle.particle_set import ParticleSet
+from relpos.fusion.particle.particle_set import ParticleSet, flat_over_peak
 
 ROWS, SIZE = 4, 301
 
@@ -111,8 +111,8 @@ def test_correction_and_the_dual_step_match_the_reference(outliers: float) -> No
     rng = np.random.default_rng(7)
     poses, weights = particles(rng)
     measured = ranges(rng)
-    noise = RangeNoise(0.7, outliers)
-    floor = noise.flat_over_peak
+    noise = ParticleSettings(sigma_r_m=0.7, outliers=outliers)
+    floor = flat_over_peak(noise)
     kernels.correct(poses, weights, measured, noise.sigma_r_m, floor, new := np.empty_like(weights))
     expected = reference.correct(poses, weights, measured, noise)
     assert new == pytest.approx(expected, rel=1e-9, abs=1e-15)
@@ -181,7 +181,7 @@ def test_points_far_from_everything_keep_their_order() -> None:
 
 def test_the_same_generator_gives_the_same_particles() -> None:
     def run() -> ParticleSet:
-        made = ParticleSet(50, 0.1, RangeNoise(), np.random.default_rng(3))
+        made = ParticleSet(ParticleSettings(50, 0.1), np.random.default_rng(3))
         for k in range(3):
             made.add(np.tile([[float(k)], [0.0], [0.0]], 50))
         for _ in range(5):

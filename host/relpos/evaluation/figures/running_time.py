@@ -35,13 +35,13 @@ def instants(run: SimulatedRun) -> Iterator[tuple[list[Motion], list[Range]]]:
 
 def through_arrays(run: SimulatedRun, particles: int, alpha: float) -> list[float]:
     """Seconds of every epoch whose measurements come as arrays (``ParticleSet``)."""
+    from relpos.fusion.estimator_settings import ParticleSettings
     from relpos.fusion.models.motion import MotionNoise
-    from relpos.fusion.models.ranging import RangeNoise
     from relpos.fusion.particle.particle_set import ParticleSet
     from relpos.fusion.timeline import Advance
 
     users = len(run.priors)
-    particle_set = ParticleSet(particles, alpha, RangeNoise(), np.random.default_rng(0))
+    particle_set = ParticleSet(ParticleSettings(particles, alpha), np.random.default_rng(0))
     for prior in run.priors:
         pose = np.array([prior.x_m, prior.y_m, prior.heading_rad])
         particle_set.add(np.repeat(pose[:, None], particles, axis=1))

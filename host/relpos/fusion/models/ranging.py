@@ -2,9 +2,7 @@
 
     p(z_ij | x_i, x_j) = N(z_ij; |x_i - x_j|, sigma_r^2)
 
-Only positive measurements are considered (paper sect. IV-C). An optional outlier share mixes in
-a density that is flat over ``outlier_span_m``, so that one wrong range cannot outvote all others;
-it is zero in the paper.
+Only positive measurements are considered (paper sect. IV-C).
 
 Heights make the distance slant: where the nodes' heights differ by h, the predicted range is
 sqrt(|x_i - x_j|^2 + h^2).
@@ -65,23 +63,6 @@ def antenna_m(mountings: Mapping[int, Mounting], node: int) -> tuple[float, floa
     """Return a node's antenna, forward and left of what moves; in its place where none is told."""
     worn = mountings.get(node)
     return (worn.antenna_offset_m if worn else None) or (0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class RangeNoise:
-    """Parameters of the ranging model: metres, and the share of outliers (0 to 1)."""
-
-    sigma_r_m: float = 2.0
-    outliers: float = 0.0
-    outlier_span_m: float = 30.0
-
-    @property
-    def flat_over_peak(self) -> float:
-        """Density of an outlier relative to the peak of all other ranges'; 0 without outliers."""
-        if self.outliers <= 0.0:
-            return 0.0
-        peak = (1.0 - self.outliers) / (math.sqrt(2.0 * math.pi) * self.sigma_r_m)
-        return self.outliers / self.outlier_span_m / peak
 
 
 def slant_height(dz_m: Floats, variance_m2: Floats) -> Floats:

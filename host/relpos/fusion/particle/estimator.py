@@ -22,7 +22,6 @@ from relpos.fusion.estimator import (
 from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, by_node, sought_node
 from relpos.fusion.models.motion import MotionNoise
-from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle.kernels import MIN_BANDWIDTH_M
 from relpos.fusion.particle.particle_set import ParticleSet
 from relpos.fusion.resampling import systematic
@@ -58,9 +57,7 @@ class ParticleFilter:
         s = self.settings
         self._rng = np.random.default_rng(self.seed)
         self._motion_noise = MotionNoise(s.sigma_d, s.sigma_theta, s.floor_d_m, s.floor_theta_rad)
-        self._particles = ParticleSet(
-            s.particles, s.alpha, RangeNoise(s.sigma_r_m, s.outliers), self._rng
-        )
+        self._particles = ParticleSet(s, self._rng)
         self._timeline = Timeline(
             [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
         )

@@ -22,29 +22,38 @@ figures.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.models.ranging import RangeNoise
+from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.particle import kernels
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+
+OUTLIER_SPAN_M = 30.0
+"""An outlier's density is flat over so much, so that one wrong range cannot outvote all others."""
+
+
+def flat_over_peak(settings: ParticleSettings) -> float:
+    """Return the density of outliers over the peak of all other ranges'; 0 without outliers."""
+    inliers = 1.0 - settings.outliers
+    peak = inliers / (math.sqrt(2.0 * math.pi) * settings.sigma_r_m)
+    return settings.outliers / OUTLIER_SPAN_M / peak
 
 
 @dataclass(slots=True)
 class ParticleSet:
     """Particles of K nodes, which are numbered in the order in which they were added.
 
-    ``size`` is M, ``poses`` (3, K, M) are x, y (m) and heading (rad), ``weights`` (K, M); every
-    row of weights sums to one.
+    M is ``settings.particles``, ``poses`` (3, K, M) are x, y (m) and heading (rad), ``weights``
+    (K, M); every row of weights sums to one.
     """
 
-    size: int
-    alpha: float
-    noise: RangeNoise
+    settings: ParticleSettings
     rng: np.random.Generator
     poses: Floats = field(init=False)
     weights: Floats = field(init=False)
@@ -54,13 +63,14 @@ class ParticleSet:
     _corrected: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
-        self.poses = np.empty((3, 0, self.size))
-        self.weights = np.empty((0, self.size))
+        self.poses = np.empty((3, 0, self.settings.particles))
+        self.weights = np.empty((0, self.settings.particles))
 
     def add(self, poses: Floats) -> int:
         """Add a node with equally likely poses (3, M); return its row."""
         self.poses = np.concatenate([self.poses, poses[:, None, :]], axis=1)
-        self.weights = np.concatenate([self.weights, np.full((1, self.size), 1.0 / self.size)])
+        size = self.settings.particles
+        self.weights = np.concatenate([self.weights, np.full((1, size), 1.0 / size)])
         self._corrected = np.empty_like(self.weights)
         return len(self.weights) - 1
 
@@ -70,10 +80,11 @@ class ParticleSet:
         ``mean`` and ``sigma`` (R, 3) are forward, left (m) and turn (rad) and their standard
         deviations.
         """
-        some = max(PARTICLES_AT_ONCE // self.size, 1)
+        size = self.settings.particles
+        some = max(PARTICLES_AT_ONCE // size, 1)
         for k in range(0, len(rows), some):
             spread = sigma[k : k + some]
-            normals = self.size * max(int(np.count_nonzero(spread)), 1)
+            normals = size * max(int(np.count_nonzero(spread)), 1)
             bits = self.rng.bit_generator.random_raw((normals + 1) // 2)
             noise = self._buffer(2 * len(bits))
             kernels.normals(bits, noise)
@@ -84,24 +95,23 @@ class ParticleSet:
 
         ``first`` and ``second`` are rows, ``height_m`` the height difference of the two nodes.
         """
-        rows = len(self.weights)
-        noise, corrected = self.noise, self._corrected
+        s, rows, corrected = self.settings, len(self.weights), self._corrected
         offset, peer, which = kernels.sort_by_node(first, second, rows)
         ranges = kernels.NodeRanges(self.means(), offset, peer, range_m[which], height_m[which])
-        floor = noise.flat_over_peak
-        kernels.correct(self.poses, self.weights, ranges, noise.sigma_r_m, floor, corrected)
-        if self.alpha > 0.0:
-            dual = max(1, round(self.alpha * self.size))
+        floor = flat_over_peak(s)
+        kernels.correct(self.poses, self.weights, ranges, s.sigma_r_m, floor, corrected)
+        if s.alpha > 0.0:
+            dual = max(1, round(s.alpha * s.particles))
             uniforms = self._uniforms(rows, kernels.DUAL_DRAWS * dual + 1)
             kernels.dual_step(
-                self.poses, self.weights, corrected, ranges, noise.sigma_r_m, floor, self.alpha,
-                uniforms,
-            )  # fmt: skip
+                self.poses, self.weights, corrected, ranges, s.sigma_r_m, floor, s.alpha, uniforms
+            )
         self.weights, self._corrected = corrected, self.weights
         effective_sizes = 1.0 / np.einsum("km,km->k", corrected, corrected)
-        low = np.flatnonzero(effective_sizes < 0.5 * self.size)
+        low = np.flatnonzero(effective_sizes < 0.5 * s.particles)
         if low.size:
-            kernels.resample(self.poses, self.weights, low, self._uniforms(low.size, self.size + 1))
+            uniforms = self._uniforms(low.size, s.particles + 1)
+            kernels.resample(self.poses, self.weights, low, uniforms)
             self.resampled += int(low.size)
 
     def means(self) -> Floats:
