@@ -29,8 +29,6 @@ Indices = npt.NDArray[np.intp]
 POSE = 3
 """Numbers of a pose: x, y (m), heading (rad)."""
 
-UNKNOWN = (math.inf, math.inf, math.inf)
-"""Standard deviations of a pose of which nothing is known."""
 
 HEADING_RESOLVED_RAD = 0.35
 """A heading below this standard deviation is known: joint filters are near enough to linear."""

@@ -353,8 +353,8 @@ def test_the_same_seed_finds_the_same_initial_poses() -> None:
 def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
     walk = Walk((0, 5 + 2j), (0.4, 2.0), *wander(30, 2, seed=3))
     search = HypothesisSearch(seed=1)
-    search.add(1, 0.0, sigma=(0.0, 0.0, 0.0))
-    search.add(2, 0.0)
+    search.add(1, 0.0, np.zeros(3), np.zeros(3))
+    search.add(2, 0.0, np.zeros(3), np.full(3, np.inf))
     copies = [search]
 
     def feed(measurement: Measurement) -> None:

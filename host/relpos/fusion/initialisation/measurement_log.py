@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initial_poses import POSE, UNKNOWN
+from relpos.fusion.initial_poses import POSE
 from relpos.fusion.initialisation.kernels import Priors, Problem, Ranges, Tracks
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -63,7 +63,7 @@ class Knot(NamedTuple):
     x_m: float
     y_m: float
     variance_rad2: float
-    time: float
+    time: int
     """Index into the log's times."""
 
 
@@ -130,10 +130,7 @@ class MeasurementLog:
 
     # -- motion --------------------------------------------------------------------------------
 
-    def add(
-        self, node: int, time_s: float, mean: Sequence[float] | Floats = (0.0, 0.0, 0.0),
-        sigma: Sequence[float] | Floats = UNKNOWN,
-    ) -> None:  # fmt: skip
+    def add(self, node: int, time_s: float, mean: Floats, sigma: Floats) -> None:
         """Log ``node`` from now on; ``mean`` and ``sigma`` (inf: unknown) of its pose now."""
         time = self._time_index(time_s)
         self._tracks[node] = track = _Track()
@@ -142,7 +139,7 @@ class MeasurementLog:
         precision = np.array(
             [0.0 if math.isinf(s) else max(s, f) ** -2 for s, f in zip(sigma, floor, strict=True)]
         )
-        self._priors[node] = _Prior(time, np.array(mean, dtype=float), precision)
+        self._priors[node] = _Prior(time, mean.copy(), precision)
         self.nodes.append(node)
         self.changed = True
 
@@ -179,7 +176,7 @@ class MeasurementLog:
         if track.variance_since_knot <= _KNOT_RAD**2:
             return None
         x_m, y_m, _ = track.pose
-        track.knots.append(Knot(x_m, y_m, track.variance_since_knot, float(len(self._times))))
+        track.knots.append(Knot(x_m, y_m, track.variance_since_knot, len(self._times)))
         track.variance_since_knot = 0.0
         count = len(track.knots)
         merged = self._merge_knots(step.node, track.knots) if count > _MOST_KNOTS else None
@@ -201,9 +198,7 @@ class MeasurementLog:
         both = older.variance_rad2 + newer.variance_rad2
         knots[k : k + 2] = [newer._replace(variance_rad2=both)]
         if drop:
-            kept = [
-                r for r in self._ranges if node not in (r.node, r.peer) or r.time >= int(newer.time)
-            ]
+            kept = [r for r in self._ranges if node not in (r.node, r.peer) or r.time >= newer.time]
             self.counters["start_ranges_forgotten"] += len(self._ranges) - len(kept)
             self._ranges = kept
         return k
@@ -320,7 +315,7 @@ class MeasurementLog:
         self._times = [self._times[t] for t in used]
         for track in self._tracks.values():
             track.samples = [track.samples[t] for t in used]
-            track.knots = [k._replace(time=float(bisect_left(used, k.time))) for k in track.knots]
+            track.knots = [k._replace(time=bisect_left(used, k.time)) for k in track.knots]
         for r in ranges:
             r.time = index[r.time]
         self._priors = {n: p._replace(time=index[p.time]) for n, p in self._priors.items()}
@@ -396,7 +391,7 @@ class MeasurementLog:
                 dx, dy = knot.x_m - track.pose[0], knot.y_m - track.pose[1]
                 tracks.knots[k + 1, i] = c * dx + s * dy, c * dy - s * dx
                 tracks.turn_variance[k, i] = knot.variance_rad2
-                tracks.segments[: int(knot.time), i] += 1
+                tracks.segments[: knot.time, i] += 1
             tracks.knots[len(track.knots) + 1 :, i] = tracks.knots[len(track.knots), i]
             priors.at[i], priors.mean[i], precision = self._priors[node]
             priors.precision[i] = precision if node in active else 1e-6

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, POSE, UNKNOWN, PoseMixture
+from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, POSE, PoseMixture
 from relpos.fusion.initialisation.hypotheses import Hypotheses, fitted, log_evidence
 from relpos.fusion.initialisation.kernels import Problem
 from relpos.fusion.initialisation.measurement_log import RANGE_SIGMA_M, MeasurementLog
@@ -96,10 +96,7 @@ class HypothesisSearch:
 
     # -- measurements --------------------------------------------------------------------------
 
-    def add(
-        self, node: int, time_s: float, mean: Sequence[float] | Floats = (0.0, 0.0, 0.0),
-        sigma: Sequence[float] | Floats = UNKNOWN,
-    ) -> None:  # fmt: skip
+    def add(self, node: int, time_s: float, mean: Floats, sigma: Floats) -> None:
         """Seek ``node`` from now on; ``mean`` and ``sigma`` (inf: unknown) of its pose now."""
         self.log.add(node, time_s, mean, sigma)
         self._fitted_poses[node] = np.zeros(POSE)
