@@ -74,6 +74,12 @@ def reported_sigmas(step: Advance) -> tuple[float, float, float]:
     )
 
 
+def known_sigmas(step: Advance) -> tuple[float, float, float]:
+    """As :func:`reported_sigmas`, 0 where none is reported."""
+    along, left, turn = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
+    return along, left, turn
+
+
 WALK_M_S, WALK_S = 1.0, 4.0
 """Speed of a person of whom no motion is reported, and how long it keeps its direction."""
 
@@ -162,7 +168,7 @@ class MotionNoise:
     def sigmas(self, step: Advance) -> tuple[float, float, float]:
         """Standard deviations of forward (m), left (m) and turn (rad) for one piece."""
         share = max(step.fraction, 1e-9) ** 0.5
-        along, left, turn = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
+        along, left, turn = known_sigmas(step)
         root_s = step.duration_s**0.5
         relative_d, relative_theta = self.sigma_d / share, self.sigma_theta / share
         floor_d, floor_theta = self.floor_d_m * root_s, self.floor_theta_rad * root_s

@@ -37,7 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.compiled import compiled
-from relpos.fusion.models.motion import reported_sigmas
+from relpos.fusion.models.motion import known_sigmas
 from relpos.fusion.timeline import Advance
 
 Floats = npt.NDArray[np.float64]
@@ -303,8 +303,8 @@ class ZeroMotionDetector:
 
 def vagueness(step: Advance) -> tuple[float, float] | None:
     """Return standard deviations (m, rad) of a piece whose report says to know next to nothing."""
-    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
-    sigma_m = min(sigma_m, step.sigma_y_m or 0.0)
+    along_m, left_m, sigma_rad = known_sigmas(step)
+    sigma_m = min(along_m, left_m)
     whole = math.sqrt(max(step.fraction, 1e-9))
     if sigma_m / whole > VAGUE_M or sigma_rad / whole > LOST_RAD:
         return sigma_m, sigma_rad

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.models.detection import Round, Rounds, on_one_floor
-from relpos.fusion.models.motion import unseen_variance
+from relpos.fusion.models.motion import known_sigmas, unseen_variance
 from relpos.fusion.models.ranging import Mounting, antenna_m, tag_height_m
 from relpos.fusion.smoother.as_learned import Rises
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
@@ -194,9 +194,9 @@ class _Builder:
                 part[0] += c * step.dx_m - s * step.dy_m
                 part[1] += s * step.dx_m + c * step.dy_m
                 part[2] += step.dtheta_rad
-                alone = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
-                part[3] += (alone or 0.0) ** 2
-                part[4] += (step.sigma_theta_rad or 0.0) ** 2
+                along_m, _, turn_rad = known_sigmas(step)
+                part[3] += along_m**2
+                part[4] += turn_rad**2
                 part[5] = max(part[5], step.duration_s / max(step.fraction, 1e-9))
                 part[6] += step.fraction
                 part[7] += step.fraction**2
