@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -168,3 +169,29 @@ def test_a_second_bag_replaces_the_first_when_asked(team: tuple[Path, Path], bag
     options = (estimate, "--run", run, "--to", "rosbag2", "--out", bag)
     assert "--overwrite" in refused(*options)
     convert(*options, "--start", START, "--overwrite")
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_without_rosbags_the_install_line_is_told_and_an_old_bag_stays(
+    team: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    convert(team[0], "--to", "rosbag2", "--out", old)
+    before = files_of(old)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    for out in (new, old):
+        words = refused(team[0], "--to", "rosbag2", "--out", out, "--overwrite")
+        assert "rosbags (extra 'ros') is not installed: " in words
+        assert "install" in words.split("installed: ")[1]
+    assert not new.exists()
+    assert files_of(old) == before
+
+
+def test_a_bag_of_nothing_is_refused_in_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
+    save_run(replace(run(truth=False), measurements=()), tmp_path / "empty")
+    words = refused(tmp_path / "empty", "--to", "rosbag2", "--out", tmp_path / "bag")
+    assert "neither measurements nor estimates nor truth" in words
+    assert not (tmp_path / "bag").exists()

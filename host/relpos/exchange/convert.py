@@ -8,7 +8,7 @@ from math import isnan
 from pathlib import Path
 from types import ModuleType
 
-from relpos.errors import DataError, RelposError
+from relpos.errors import DataError
 from relpos.exchange.content import (
     PLACED,
     Content,
@@ -246,6 +246,11 @@ def write(
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
     the same format left is removed, because it is no part of this one.
     """
+    if form is Format.ROSBAG2:
+        # Before the old bag is removed.
+        from relpos.exchange.rosbag2 import needs_rosbags
+
+        needs_rosbags()
     _make_room(out, form, overwrite=overwrite)
     if TRAITS[form].one_file:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -255,10 +260,9 @@ def write(
     out.mkdir(parents=True, exist_ok=True)
     try:
         return _WRITERS[form](content, out)
-    except RelposError:
-        if new and not any(out.iterdir()):
+    finally:
+        if new and out.is_dir() and not any(out.iterdir()):
             out.rmdir()
-        raise
 
 
 def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
