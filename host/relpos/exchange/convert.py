@@ -18,7 +18,7 @@ from relpos.exchange.content import (
     points_of,
 )
 from relpos.exchange.formats import TRAITS, Format, Kind, format_of
-from relpos.exchange.times import iso_of
+from relpos.exchange.times import iso_of, possible
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
@@ -246,6 +246,10 @@ def write(
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
     the same format left is removed, because it is no part of this one.
     """
+    if content.start_unix_s is not None:
+        # A recording's or a GPX file's own start may be anything.
+        where = f"{content.run.name}: second 0 of the run (--start says otherwise)"
+        possible(content.start_unix_s, iso_of(content.start_unix_s), where)
     if form is Format.ROSBAG2:
         # Before the old bag is removed.
         from relpos.exchange.rosbag2 import needs_rosbags
