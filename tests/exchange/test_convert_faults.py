@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from relpos.errors import DataError
+from relpos.exchange import tables
+from relpos.exchange.content import Content
 from relpos.exchange.times import LATEST_UNIX_S, unix_of
-from support.small_team import convert, refused, written
+from support.small_team import convert, refused, run, written
 
 PIN = "48.137,11.575,60,520"
 START = "2026-05-04T09:30:00Z"
@@ -65,3 +67,36 @@ def test_a_start_that_a_gpx_file_has_by_mistake_is_refused_and_may_be_replaced(
     assert "--start" in line
     assert "'1930-05-04T09:30:00.000Z' is not between 1970-01-01" in line
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "theirs",
+    [
+        b'who,what\n1,2,3\n"a"\n',
+        b"node,time_s\nL\xfctzow,1\n",
+        b"time_s,node,note\n1.0,2,mine\n",
+        b"",
+    ],
+    ids=["ragged", "latin-1", "as-ours", "empty"],
+)
+def test_csv_files_of_others_in_the_output_folder_are_left_as_they_are(
+    tmp_path: Path, theirs: bytes
+) -> None:
+    yard, fused = written(tmp_path)
+    out = tmp_path / "out"
+    convert(fused, "--run", yard, "--to", "csv", "--out", out)
+    expected = {path.name: path.read_bytes() for path in out.iterdir()}
+    (out / "zz_notes.csv").write_bytes(theirs)
+    for options in ((), ("--start", START), ()):
+        words = ("--run", yard, "--to", "csv", "--out", out, *options, "--overwrite")
+        result = convert(fused, *words)
+        assert (out / "zz_notes.csv").read_bytes() == theirs
+        assert out / "zz_notes.csv" not in result.files
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.name != "zz_notes.csv"} == expected
+
+
+def test_a_table_to_which_no_column_is_added_keeps_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "temperature.csv"
+    path.write_text("time_s,celsius\n1.0,20.5\n2.0,21\n")
+    tables._extend(path, Content(run()), {})
+    assert path.read_text() == "time_s,celsius\n1.0,20.5\n2.0,21\n"

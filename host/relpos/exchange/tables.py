@@ -7,7 +7,7 @@ directory and an estimate directory still.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from relpos.exchange.content import Content
 from relpos.exchange.formats import Kind
 from relpos.runs.appending import write_rows
 from relpos.runs.estimates import write_estimates
-from relpos.runs.run import save_run
+from relpos.runs.run import TABLE_NAMES, save_run
 from relpos.tracks import Track, sample
 
 _OF_PAIRS = ("pairs.csv", "ranges.csv")
@@ -30,9 +30,11 @@ def write_tables(content: Content, directory: Path) -> list[Path]:
     """Write every table there is something for, one header line each; return them."""
     directory.mkdir(parents=True, exist_ok=True)
     save_run(content.run, directory)
+    # Other files in there are not relpos's to change.
+    written = {path for name in TABLE_NAMES if (path := directory / name).exists()}
     if content.estimates:
-        write_estimates(directory, content.estimates, steps=content.run.steps)
-    paths = sorted(directory.glob("*.csv"))
+        written |= {*write_estimates(directory, content.estimates, steps=content.run.steps)}
+    paths = sorted(written)
     true = content.tracks_of(Kind.TRUTH)
     for path in paths:
         if path.name not in _AS_THEY_ARE:
@@ -59,12 +61,11 @@ def _extend(path: Path, content: Content, true: Mapping[int, Track]) -> None:
     write_rows(
         path,
         [*header, *columns],
-        ([*row.values(), *more] for row, more in zip(rows, _transposed(columns), strict=True)),
+        (
+            [*row.values(), *(column[k] for column in columns.values())]
+            for k, row in enumerate(rows)
+        ),
     )
-
-
-def _transposed(columns: Mapping[str, Sequence[object]]) -> Iterable[Sequence[object]]:
-    return zip(*columns.values(), strict=True)
 
 
 def _true_distances(rows: _Rows, true: Mapping[int, Track]) -> list[object]:
