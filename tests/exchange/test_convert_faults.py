@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from relpos.errors import DataError
+from relpos.errors import DataError, words_of
+from relpos.evaluation import report
 from relpos.exchange import tables
 from relpos.exchange.content import Content
 from relpos.exchange.times import LATEST_UNIX_S, unix_of
+from relpos.files import write_output
+from relpos.live.log_files import log_row, write_kml
+from relpos.live.team_view import LogEntry
+from relpos.runs.appending import write_rows
+from relpos.runs.log import LOG_COLUMNS
 from support.small_team import convert, refused, run, written
 
 PIN = "48.137,11.575,60,520"
@@ -100,3 +110,103 @@ def test_a_table_to_which_no_column_is_added_keeps_its_rows(tmp_path: Path) -> N
     path.write_text("time_s,celsius\n1.0,20.5\n2.0,21\n")
     tables._extend(path, Content(run()), {})
     assert path.read_text() == "time_s,celsius\n1.0,20.5\n2.0,21\n"
+
+
+# -- full disks ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def no_room_for(most_bytes: int) -> Iterator[None]:
+    """No file may become longer: the system refuses the write, as that of a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
+        for path in folder.rglob("*")
+    }
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        ("gpx", ""),
+        ("geojson", ""),
+        ("tum", "truth_1.tum"),
+        ("csv", "motion.csv"),
+        ("run", "motion.csv"),
+        ("rosbag2", ""),
+    ],
+)
+def test_on_a_full_disk_the_file_is_named_the_old_one_stays_and_no_stub_is_left(
+    tmp_path: Path, form: str, name: str
+) -> None:
+    yard, _ = written(tmp_path)
+    options = (yard, "--pin", PIN, "--to", form, "--out")
+    old, new = tmp_path / f"old.{form}", tmp_path / f"new.{form}"
+    convert(*options, old)
+    before = tree(tmp_path)
+    for out in (old, new):
+        with no_room_for(1000):
+            words = refused(*options, out, "--overwrite", "--start", START)
+        assert words.removeprefix("relpos: ").startswith(f"{out / name}: ")
+        assert words.endswith("File too large")
+        assert tree(tmp_path) == before
+        convert(*options, out, *["--overwrite"] * (out == old))
+        before = tree(tmp_path)
+
+
+@pytest.mark.parametrize("form", ["gpx", "geojson"])
+def test_a_link_in_the_place_of_a_map_is_followed(tmp_path: Path, form: str) -> None:
+    yard, _ = written(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    real, link = tmp_path / "elsewhere" / "real", tmp_path / f"link.{form}"
+    real.write_text("old")
+    link.symlink_to(real)
+    convert(yard, "--pin", PIN, "--to", form, "--out", link, "--overwrite")
+    assert link.is_symlink()
+    assert len(real.read_bytes()) > 1000
+    assert [path.name for path in real.parent.iterdir()] == ["real"]
+
+
+def test_what_is_no_file_is_written_into_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_output(pipe, "a log")
+        write_rows(pipe, ["time_s"], [[1.0]])
+        assert os.read(reader, 100) == b"a logtime_s\n1.0\n"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+@pytest.mark.parametrize("what", ["kml", "csv", "html"])
+def test_a_log_or_report_on_a_full_disk_is_named_and_the_old_one_stays(
+    tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"old.{what}"
+    entry = LogEntry(3.0, 1.7e9, "landmark", "Ben is at a landmark " * 200, 2)
+    path.write_text("old")
+    monkeypatch.setattr(report, "_drawn", lambda *_: {})
+    monkeypatch.setattr(report, "page", lambda *_: "page" * 1000)
+    write = {
+        "kml": lambda: write_kml(path, "mill", [entry]),
+        "csv": lambda: write_rows(path, LOG_COLUMNS, [log_row(entry)]),
+        "html": lambda: report.write(None, path),  # type: ignore[arg-type]
+    }[what]
+    with no_room_for(1000), pytest.raises(OSError, match="File too large") as caught:
+        write()
+    assert words_of(caught.value) == f"{path}: File too large"
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+    write()
+    assert len(path.read_bytes()) > 1000

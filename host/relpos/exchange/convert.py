@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 
 from relpos.errors import DataError
@@ -25,6 +26,8 @@ from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
 from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
 from relpos.runs.table import find_table, remove_table
+
+_Written = tuple[list[Path], list[str]]
 
 RECEIVED = "received"
 """Folder in which ``relpos fuse PORT`` stores the run of its estimates."""
@@ -240,7 +243,7 @@ def located_alone(content: Content) -> Content:
 
 def write(
     content: Content, form: Format, out: Path, *, pins: Sequence[Pin] = (), overwrite: bool = False
-) -> tuple[list[Path], list[str]]:
+) -> _Written:
     """Write the content to ``out``; return the files and remarks about them.
 
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
@@ -250,23 +253,35 @@ def write(
         # A recording's or a GPX file's own start may be anything.
         where = f"{content.run.name}: second 0 of the run (--start says otherwise)"
         possible(content.start_unix_s, iso_of(content.start_unix_s), where)
-    if form is Format.ROSBAG2:
-        # Before the old bag is removed.
-        from relpos.exchange.rosbag2 import needs_rosbags
-
-        needs_rosbags()
     _make_room(out, form, overwrite=overwrite)
     if TRAITS[form].one_file:
         out.parent.mkdir(parents=True, exist_ok=True)
         on_map = TRAITS[form].on_map
         return _write_map(content, form, out, pins) if on_map else _WRITERS[form](content, out)
+    return _write_folder(content, form, out)
+
+
+def _write_folder(content: Content, form: Format, out: Path) -> _Written:
+    """Write all files of a format beside the old ones, and put them in their place together."""
     new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     try:
-        return _WRITERS[form](content, out)
+        with TemporaryDirectory(prefix=".part-", dir=out) as beside:
+            part = Path(beside) / out.resolve().name  # A bag's files are named after the folder.
+            try:
+                files, remarks = _WRITERS[form](content, part)
+            except OSError as error:
+                at = Path(error.filename or part)
+                if at.is_relative_to(part):
+                    error.filename = str(out / at.relative_to(part))
+                raise
+            _remove_old(out, form)
+            for path in part.iterdir():
+                path.replace(out / path.name)
     finally:
-        if new and out.is_dir() and not any(out.iterdir()):
+        if new and not any(out.iterdir()):
             out.rmdir()
+    return [out / path.name for path in files], remarks
 
 
 def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
@@ -278,22 +293,20 @@ def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
         return
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: a file; {form} is a directory")
-    if not out.is_dir() or not any(out.iterdir()):
-        return
-    if not overwrite:
+    if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise DataError(f"{out}: is there already and not empty (--overwrite replaces it)")
+
+
+def _remove_old(out: Path, form: Format) -> None:
+    """Remove what an earlier conversion to the same format has left."""
     old = list(out.glob("*.tum")) if form is Format.TUM else []
     if form is Format.ROSBAG2:
         old = [out / "metadata.yaml", *out.glob("*.mcap")]
     for path in old:
         path.unlink(missing_ok=True)
     if form in (Format.RUN, Format.CSV):
-        # Those of a run are replaced or removed where it is written.
-        for name in _ESTIMATE_TABLES:
+        for name in (*TABLE_NAMES, *_ESTIMATE_TABLES):
             remove_table(out, name)
-
-
-_Written = tuple[list[Path], list[str]]
 
 
 def _write_run(content: Content, out: Path) -> _Written:
@@ -331,6 +344,7 @@ def _write_mcap(content: Content, out: Path) -> _Written:
 def _write_tum(content: Content, out: Path) -> _Written:
     from relpos.exchange.tum import file_name, write_tum
 
+    out.mkdir()
     files: list[Path] = []
     remarks: list[str] = []
     for kind in Kind:
@@ -385,8 +399,6 @@ def _write_map(content: Content, form: Format, out: Path, pins: Sequence[Pin]) -
 def _write_rosbag2(content: Content, out: Path) -> _Written:
     from relpos.exchange.rosbag2 import write_rosbag2
 
-    if not any(out.iterdir()):
-        out.rmdir()  # The library makes it itself.
     write_rosbag2(out, content)
     return sorted(out.iterdir()), _undated(content)
 

@@ -19,6 +19,7 @@ from relpos.errors import DataError
 from relpos.exchange.content import PLACED, Content, Point, on_map, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.exchange.times import iso_of, unix_of
+from relpos.files import write_output
 from relpos.fusion.estimator import NodeEstimate
 from relpos.geodesy import MapFrame
 from relpos.runs.landmarks import Landmark
@@ -43,7 +44,7 @@ def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: Map
         position = _positions([Point(0.0, 0, mark.x_m, mark.y_m, _nan(mark.z_m))], frame)[0]
         features.append(_feature("Point", position, {"kind": "landmark", "id": mark.landmark}))
     document = {"type": "FeatureCollection", "features": features}
-    path.write_text(json.dumps(document, allow_nan=False, ensure_ascii=False), encoding="utf-8")
+    write_output(path, json.dumps(document, allow_nan=False, ensure_ascii=False))
 
 
 def _track(

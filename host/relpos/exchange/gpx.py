@@ -17,7 +17,7 @@ from relpos.exchange.content import Content, Point, on_map, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.exchange.times import time_of
 from relpos.extras import missing_extra
-from relpos.files import printable
+from relpos.files import printable, write_output
 from relpos.geodesy import MapFrame
 from relpos.runs.landmarks import Landmark
 from relpos.runs.table import read_text
@@ -47,7 +47,7 @@ def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: Map
                 for p, (lat, lon, height) in zip(piece, on_map(piece, frame), strict=True):
                     time = None if start_unix_s is None else time_of(start_unix_s + p.time_s)
                     segment.points.append(gpx.GPXTrackPoint(lat, lon, elevation=height, time=time))
-    path.write_text(document.to_xml(version="1.1"), encoding="utf-8")
+    write_output(path, document.to_xml(version="1.1"))
 
 
 def first_time(path: Path) -> float | None:

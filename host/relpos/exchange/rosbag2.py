@@ -28,21 +28,13 @@ MOST_RANGE_M = 100.0
 _Rows = Iterator[tuple[float, str, str, Any]]
 
 
-def needs_rosbags() -> None:
-    """Raise RelposError with the line that installs rosbags where it is missing."""
-    try:
-        import rosbags.rosbag2
-        import rosbags.typesys  # noqa: F401
-    except ImportError:
-        raise missing_extra("rosbags", "ros") from None
-
-
 def write_rosbag2(out: Path, content: Content) -> None:
     """Write everything that has a standard message, by time, as a bag in the folder ``out``."""
-    needs_rosbags()
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise missing_extra("rosbags", "ros") from None
     store = get_typestore(Stores.ROS2_HUMBLE)
     messages = _Messages(store.types, content)
     rows = [*messages.estimates(), *messages.motions(), *messages.ranges(), *messages.truth()]

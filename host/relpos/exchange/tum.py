@@ -16,6 +16,7 @@ from pathlib import Path
 from relpos.errors import DataError
 from relpos.exchange.content import Point
 from relpos.exchange.formats import Kind
+from relpos.files import write_output
 from relpos.runs.table import number, read_text
 
 UNIX_TIME_S = 1.0e8
@@ -40,7 +41,7 @@ def write_tum(path: Path, points: Sequence[Point]) -> None:
             f"{p.time_s:.6f} {p.x_m:.6f} {p.y_m:.6f} {z_m:.6f} "
             f"0 0 {math.sin(half_rad):.9f} {math.cos(half_rad):.9f}"
         )
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_output(path, "\n".join(lines) + "\n")
 
 
 def read_tum(path: Path, node: int, start_unix_s: float | None) -> list[Point]:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
-from relpos.files import printable
+from relpos.files import open_output, printable
 from relpos.live.team_view import LogEntry
 from relpos.runs.log import shielded
 
@@ -50,4 +50,5 @@ def write_kml(
             point = ElementTree.SubElement(mark, "Point")
             where = f"{longitude:.9f},{latitude:.9f}"
             ElementTree.SubElement(point, "coordinates").text = where
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    with open_output(path) as file:
+        ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from relpos.files import write_whole
+from relpos.files import open_output, write_whole
 
 WRITE_EVERY_S = 0.2
 MOST_WAITING_BYTES = 64 << 20
@@ -25,14 +25,12 @@ MOST_WAITING_BYTES = 64 << 20
 
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows([_cell(value) for value in row] for row in rows)
-    except OSError as error:
-        error.filename = error.filename or str(path)
-        raise
+    with open_output(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+        text.detach()
 
 
 class AppendedTable:

@@ -15,6 +15,7 @@ from relpos.evaluation.report.drawing import Picture, inline, save, svg
 from relpos.evaluation.report.page import page
 from relpos.evaluation.report.pictures import PICTURES, pictures
 from relpos.extras import require
+from relpos.files import write_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +25,7 @@ def write(content: Content, path: Path | str, figures: Path | str | None = None)
     """Write the page of a run; the figures also as SVG and PNG into a folder. Return its path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page(content, _drawn(content, figures)), encoding="utf-8")
+    write_output(path, page(content, _drawn(content, figures)))
     return path
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation.style import DARK, STYLE
+from relpos.files import open_output, write_output
 from relpos.tracks import MAX_GAP_S, Tracks, interpolate
 
 if TYPE_CHECKING:
@@ -79,10 +80,10 @@ def svg(figure: Figure) -> str:
 def save(figure: Figure, document: str, directory: Path, name: str) -> list[Path]:
     """Write NAME.svg and NAME.png; return their paths."""
     paths = [directory / f"{name}.svg", directory / f"{name}.png"]
-    paths[0].write_text(document, encoding="utf-8")
-    with _styled():
+    write_output(paths[0], document)
+    with _styled(), open_output(paths[1]) as file:
         # Without a date in it the same report is the same file.
-        figure.savefig(paths[1], dpi=130, metadata={"Software": None})
+        figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
     return paths
 
 
