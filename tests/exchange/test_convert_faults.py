@@ -112,6 +112,30 @@ def test_a_table_to_which_no_column_is_added_keeps_its_rows(tmp_path: Path) -> N
     assert path.read_text() == "time_s,celsius\n1.0,20.5\n2.0,21\n"
 
 
+@pytest.mark.parametrize(
+    ("form", "old", "theirs"),
+    [
+        ("tum", "estimate_9.tum", ["mocap.tum", "truth_vicon.tum", "notes.txt"]),
+        ("rosbag2", "old name.mcap", ["walk.mcap", "notes.txt"]),
+    ],
+)
+def test_overwriting_removes_the_old_files_of_the_format_and_none_of_others(
+    tmp_path: Path, form: str, old: str, theirs: list[str]
+) -> None:
+    yard, _ = written(tmp_path)
+    out = tmp_path / "old name"
+    convert(yard, "--to", form, "--out", out)
+    out = out.rename(tmp_path / "new name")
+    for name in theirs:
+        (out / name).write_text("mine")
+    if form == "tum":
+        (out / old).write_text("of a node that was there")
+    result = convert(yard, "--to", form, "--out", out, "--overwrite")
+    assert not (out / old).exists()
+    assert [(out / name).read_text() for name in theirs] == ["mine"] * len(theirs)
+    assert {path.name for path in out.iterdir()} == {*theirs, *(p.name for p in result.files)}
+
+
 # -- full disks ------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
@@ -298,12 +299,19 @@ def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
 
 
 def _remove_old(out: Path, form: Format) -> None:
-    """Remove what an earlier conversion to the same format has left."""
-    old = list(out.glob("*.tum")) if form is Format.TUM else []
-    if form is Format.ROSBAG2:
-        old = [out / "metadata.yaml", *out.glob("*.mcap")]
+    """Remove what an earlier conversion to the same format has left, and nothing of others."""
+    old: list[Path] = []
+    if form is Format.TUM:
+        ours = re.compile(rf"({'|'.join(Kind)})_[0-9]+\.tum")
+        old = [path for path in out.iterdir() if ours.fullmatch(path.name)]
+    about = out / "metadata.yaml"
+    if form is Format.ROSBAG2 and about.is_file():
+        # Of the old bag is what it lists; another .mcap is somebody's recording.
+        lines = about.read_text(encoding="utf-8", errors="replace").splitlines()
+        listed = {line.strip().removeprefix("- ") for line in lines}
+        old = [about, *(path for path in out.glob("*.mcap") if path.name in listed)]
     for path in old:
-        path.unlink(missing_ok=True)
+        path.unlink()
     if form in (Format.RUN, Format.CSV):
         for name in (*TABLE_NAMES, *_ESTIMATE_TABLES):
             remove_table(out, name)
