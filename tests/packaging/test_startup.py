@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,38 @@ def test_the_page_s_serving_process_imports_no_estimator():
         capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
     assert done.stdout == "[]\n"
+
+
+INTERRUPTED = """
+import importlib, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == "relpos.cli.emulate":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, CtrlC())
+module, _, name = sys.argv.pop(1).partition(":")
+getattr(importlib.import_module(module), name)()
+"""
+
+
+def test_an_interrupt_while_the_commands_are_imported_is_one_clear_line():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, project["scripts"]["relpos"], "fuse", "/dev/ttyNOPE7"],
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "relpos: interrupted\n")
+
+
+def test_the_package_itself_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "relpos", "--version"],
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=True,
+    )  # fmt: skip
+    assert done.stdout.startswith("relpos ")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
