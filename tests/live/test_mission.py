@@ -224,6 +224,8 @@ def test_a_place_that_is_none_costs_that_place_and_no_other(tmp_path: Path, x_m:
     assert resumed.tracks.of(1) == [(4.0, 1.0, 1.0)]
 
 
+HUGE = 10**400
+"""No float is so large."""
 STRANGE = [
     "[" * 100_000, "7", '{"kind": 3}', '{"kind": "log"}', '{"kind": "log", "entry": 5}',
     '{"kind": "log", "entry": {"time_s": NaN, "unix_s": 1, "kind": "note", "text": "a"}}',
@@ -232,6 +234,7 @@ STRANGE = [
     '{"kind": "device"}', '{"kind": "name", "node": 1}', '{"kind": "name", "node": 1, "name": 5}',
     '{"kind": "alert", "node": 1, "alert": "x"}', '{"kind": "rollcall", "action": "answer"}',
     '{"kind": "shelve", "node": 1}', '{"kind": "presses"}', '{"kind": "board", "node": [1]}',
+    *(f'{{"kind": "shelve", "node": 1, "seconds": {HUGE}, "unix_s": {u}}}' for u in (1, HUGE)),
 ]  # fmt: skip
 
 
@@ -257,6 +260,56 @@ def test_a_description_that_is_none_of_ours_is_one_line(tmp_path, text):
     (tmp_path / "mission.json").write_text(text)
     with pytest.raises(DataError, match="not a mission's folder"):
         Mission.open(tmp_path)
+
+
+@pytest.mark.parametrize("field", ["started_unix_s", "ended_unix_s"])
+@pytest.mark.parametrize("value", [HUGE, 10**18, 1e300, -1.0], ids=["huge", "late", "far", "-1"])
+def test_a_description_whose_date_is_none_is_one_line(tmp_path, field, value):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    found = json.loads((mission.path / "mission.json").read_text())
+    (mission.path / "mission.json").write_text(json.dumps(found | {field: value}))
+    with pytest.raises(DataError, match="not a mission's folder"):
+        Mission.open(mission.path)
+
+
+@pytest.mark.parametrize("name", ["time_s", "arrived_s", "node"])
+def test_a_checkpoint_of_huge_numbers_costs_what_it_says_and_no_more(tmp_path, name):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    row = {"node": 1, "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0}
+    found = {"time_s": 5.0, "arrived_s": 6.0, "heard_s": {"1": 4.0}, "priors": [row]}
+    (row if name in row else found)[name] = HUGE
+    (mission.path / "checkpoint.json").write_text(json.dumps(found))
+    assert mission.resume().priors == ()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("time_s", HUGE), ("unix_s", 1e18), ("unix_s", HUGE)],
+    ids=["time", "late date", "date"],
+)
+@pytest.mark.parametrize("log", ["log.csv", "log.kml"])
+def test_a_line_of_the_log_whose_time_is_none_is_left_out_of_the_files(tmp_path, field, value, log):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    mission.about.sessions = 1
+    mission.save()
+    recorder = make_recorder(mission.recording(1), About(round(time.time() * 1e9)))
+    recorder.received(0.5, b"anything")
+    recorder.close()
+    entry = {"time_s": 1.0, "unix_s": 1.7e9, "kind": "note", "text": "to be kept"}
+    strange = entry | {field: value, "text": "not"}
+    lines = [json.dumps({"kind": "log", "entry": e}) for e in (strange, entry)]
+    (mission.path / JOURNAL).write_text("\n".join(lines))
+    path = tmp_path / log
+    done = CliRunner().invoke(main.app, ["replay", str(mission.path), "--log", str(path)])
+    assert "1 lines written" in done.output, done.output
+    assert "to be kept" in path.read_text()
+
+
+def test_a_device_stays_shut_out_after_a_week(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    event = {"kind": "device", "id": "a", "action": "shut", "time_s": 9e5, "unix_s": 1.7e9}
+    (mission.path / JOURNAL).write_text(json.dumps(event))
+    assert list(mission.events()) == [event]
 
 
 @pytest.mark.parametrize("name", ["lock", "journal.jsonl", "plans", "mission.json.new"])

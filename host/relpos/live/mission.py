@@ -50,6 +50,8 @@ SYNC_S = 0.4
 KEEP_LOOK_S = 0.005
 MOST_ABOUT_BYTES = MOST_LINE_BYTES = 1 << 20
 KEY_BYTES = 32
+LAST_UNIX_S = 253_402_300_799.0
+"""The end of the year 9999: no date is later."""
 
 
 @dataclass
@@ -78,10 +80,10 @@ class About:
         if not (
             isinstance(about.name, str)
             and isinstance(about.source, str)
-            and _is_number(about.started_unix_s)
+            and _is_moment(about.started_unix_s)
             and type(about.sessions) is int
             and (about.port is None or (type(about.port) is int and 0 < about.port < 65536))
-            and (about.ended_unix_s is None or _is_number(about.ended_unix_s))
+            and (about.ended_unix_s is None or _is_moment(about.ended_unix_s))
             and type(about.common) is bool
             and type(about.https) is bool
             and (about.post is None or (type(about.post) is int and about.post > 0))
@@ -433,6 +435,11 @@ def _judged(event: dict[str, Any]) -> dict[str, Any]:
     to_json(event)  # No NaN, which no page could be sent.
     if not all(isinstance(event[k], kinds) for k, kinds in _KINDS.items() if k in event):
         raise ValueError("values of another kind")
+    # Not within the bounds of measurements: a device stays shut out after a week, too.
+    if not all(_is_moment(abs(event[k])) for k in ("time_s", "seconds") if k in event):
+        raise ValueError("not a time")
+    if not _is_moment(event.get("unix_s", 0.0)):
+        raise ValueError("not a date")
     return event
 
 
@@ -448,7 +455,15 @@ def _object(text: str | bytes) -> dict[str, Any]:
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    try:
+        return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    except OverflowError:  # An integer of hundreds of digits.
+        return False
+
+
+def _is_moment(value: Any) -> bool:
+    """Return whether a value is Unix time, or seconds that may be added to it."""
+    return _is_number(value) and 0.0 <= value <= LAST_UNIX_S
 
 
 def _bounded(name: str, value: Any) -> Any:
