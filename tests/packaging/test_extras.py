@@ -9,8 +9,10 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from relpos import extras
+from relpos.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -105,3 +107,16 @@ def test_a_recording_without_the_extra_is_one_clear_line(arguments, tmp_path):
     (line,) = done.stderr.splitlines()
     assert done.returncode == 1
     assert "(extra 'recording') is not installed" in line
+
+
+@pytest.mark.parametrize("package", ["pymap3d", "pytak"])
+def test_what_a_map_needs_is_asked_for_before_the_session_begins(package, tmp_path, monkeypatch):
+    monkeypatch.setattr("relpos.extras._installed", lambda line: not line.startswith(package))
+    monkeypatch.setattr("relpos.fusion.warm_up", lambda name: pytest.fail("it prepares first"))
+    asked = ["fuse", "loop://", "--cot", "udp://127.0.0.1:6969", "--pin", "52,13,0"]
+    done = CliRunner().invoke(app, [*asked, "--seconds", "1", "--out", str(tmp_path / "o")])
+    (line,) = done.stderr.splitlines()
+    assert done.exit_code == 1
+    assert package in line
+    assert "(extra 'exchange') is not installed" in line
+    assert not (tmp_path / "o").exists()

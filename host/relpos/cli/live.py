@@ -250,10 +250,12 @@ def terminal_sink(me: int | None) -> MakeSink:
 
 def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
     """Return a maker of the sender to TAK; DataError at once where URL or pins cannot work."""
+    from relpos.extras import require
     from relpos.geodesy import parse_pin
     from relpos.live.cot import CotSender, PinnedFrame, check_url
 
     check_url(url)
+    require("exchange")
     placed = [parse_pin(pin) for pin in pins]
     for words in PinnedFrame(placed).remarks:
         output.remark(words)
