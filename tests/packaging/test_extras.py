@@ -120,3 +120,25 @@ def test_what_a_map_needs_is_asked_for_before_the_session_begins(package, tmp_pa
     assert package in line
     assert "(extra 'exchange') is not installed" in line
     assert not (tmp_path / "o").exists()
+
+
+WITHOUT = """
+import sys
+sys.modules[sys.argv.pop(1)] = None
+from relpos.cli.main import app
+app(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("library", ["segno", "starlette"])
+@pytest.mark.parametrize("arguments", ["mission m loop://", "fuse loop:// --view"])
+def test_a_page_without_its_libraries_is_one_clear_line_and_no_folder(library, arguments, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT, library, *arguments.split()], cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert f"{library} (extra 'view') is not installed" in line
+    assert not list(tmp_path.iterdir())

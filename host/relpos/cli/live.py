@@ -150,8 +150,9 @@ class Options:
     def check(self) -> None:
         """Raise RelposError, before minutes of preparing, where an option cannot work."""
         if self.view and self.door is None:
-            from relpos.view.access import listen
+            from relpos.view.access import check_libraries, listen
 
+            check_libraries()
             listen(self.view_listen)[0].close()
         if self.foxglove is not None:
             parse_listen(self.foxglove, "--foxglove")

@@ -70,8 +70,9 @@ def mission(
     """
     from relpos.link.port import check_port
     from relpos.live.mission import ABOUT, Mission
-    from relpos.view.access import DEFAULT_PORT, listen
+    from relpos.view.access import DEFAULT_PORT, check_libraries, listen
 
+    check_libraries()  # Before there is a folder.
     if invite is not None:
         _print_invitation(Mission.open(folder), invite, view_listen)
         return

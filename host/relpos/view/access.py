@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -21,6 +22,8 @@ from relpos.live.addresses import parse_listen
 from relpos.view.devices import Gate, Role
 
 DEFAULT_PORT = 8460
+LIBRARIES = ("segno", "starlette", "uvicorn", "websockets")
+"""What every page needs."""
 LOOK_S = 0.1
 """How often a taken port is tried again."""
 TOKEN_BYTES = 16
@@ -117,6 +120,13 @@ class Allowance:
         if len(self._left) > self.MOST_VISITORS:
             del self._left[next(iter(self._left))]
         return allowed
+
+
+def check_libraries() -> None:
+    """Raise RelposError where a library of the pages is not installed."""
+    for library in LIBRARIES:
+        if find_spec(library) is None:
+            raise missing_extra(library, "view")
 
 
 def listen(

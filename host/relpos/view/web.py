@@ -14,10 +14,8 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeStatus
 from relpos.live.board import Board
 from relpos.live.requests import Request
@@ -25,7 +23,7 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import MAX_LOG, Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said
-from relpos.view.access import Access
+from relpos.view.access import Access, check_libraries
 from relpos.view.process import serve
 
 if TYPE_CHECKING:
@@ -47,9 +45,7 @@ class WebView(Sink):
     """
 
     def __init__(self, listener: socket.socket, access: Access, hello: Hello) -> None:
-        for library in ("starlette", "uvicorn", "websockets"):
-            if find_spec(library) is None:
-                raise missing_extra(library, "view")
+        check_libraries()
         self.access = access
         self.hello = hello
         self.restarts = 0
