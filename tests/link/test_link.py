@@ -459,6 +459,28 @@ def test_a_port_that_does_not_exist_is_named_in_one_line():
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("ask", [serial_port.open_port, serial_port.check_port])
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("socket://", "HOST:PORT is missing, as in socket://HOST:PORT"),
+        ("socket://host", "HOST:PORT is missing, as in socket://HOST:PORT"),
+        ("socket://:4000", "HOST:PORT is missing, as in socket://HOST:PORT"),
+        ("rfc2217://", "HOST:PORT is missing, as in rfc2217://HOST:PORT"),
+        ("socket://host:99999", "Port out of range 0-65535"),
+    ],
+)
+def test_an_address_without_host_or_port_is_told_in_plain_words(ask, port, reason):
+    with pytest.raises(DeviceError) as caught:
+        ask(port)
+    assert str(caught.value) == f"{port}: cannot open the serial port: {reason}"
+
+
+def test_a_device_that_is_no_serial_port_is_told_in_plain_words():
+    with pytest.raises(DeviceError, match=r"^/dev/null: cannot open.*: not a serial port$"):
+        serial_port.open_port("/dev/null")
+
+
 def test_a_port_that_vanishes_is_an_error_after_all_that_came_before():
     master, slave = pty.openpty()
     device = serial_port.open_port(os.ttyname(slave))

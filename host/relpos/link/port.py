@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import serial
 
@@ -238,6 +240,9 @@ class Link:
 
 def check_port(port: str) -> None:
     """Raise DeviceError where there is no such port, without opening it."""
+    fault = _address_fault(port)
+    if fault:
+        raise _cannot_open(port, ValueError(fault))
     try:
         serial.serial_for_url(port, do_not_open=True)
     except (serial.SerialException, OSError, ValueError) as error:
@@ -259,7 +264,8 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
 
 
 def _cannot_open(port: str, error: Exception) -> DeviceError:
-    reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
+    known = "://" in port or Path(port).exists()
+    reason = (_address_fault(port) or _reason(error)) if known else "no such device"
     return DeviceError(
         Said(
             "port-closed",
@@ -268,6 +274,19 @@ def _cannot_open(port: str, error: Exception) -> DeviceError:
             reason=reason,
         )
     )
+
+
+def _address_fault(port: str) -> str | None:
+    """Say what is wrong with an address in the network: pyserial shows how its own check fails."""
+    scheme, found, _ = port.partition("://")
+    if not found or scheme.lower() not in ("socket", "rfc2217"):
+        return None
+    try:
+        parts = urlsplit(port)
+        complete = parts.hostname and parts.port is not None
+    except ValueError as error:
+        return str(error)
+    return None if complete else f"HOST:PORT is missing, as in {scheme}://HOST:PORT"
 
 
 def incarnation(port: str) -> object:
@@ -310,6 +329,9 @@ def vanished(device: Line, error: Exception) -> DeviceError:
 def _reason(error: Exception) -> str:
     if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
         return "another program has it open"
+    # termios says so, and pyserial's own error has no number.
+    if getattr(error.__context__, "args", ())[:1] == (errno.ENOTTY,):
+        return "not a serial port"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return str(error).splitlines()[0]
