@@ -14,6 +14,11 @@ def printable(text: str) -> str:
     return "".join(letter for letter in text if letter.isprintable())
 
 
+def displayable(text: str) -> str:
+    """Show as ``?`` what is no text: bytes of a file's name that are not UTF-8."""
+    return text.encode("utf-8", "replace").decode()
+
+
 def write_whole(path: Path, data: bytes, *, sync: bool = False, mode: int = 0o666) -> None:
     """Write a file beside the one that is there, and put it in its place; OSError.
 

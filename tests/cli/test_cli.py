@@ -419,6 +419,21 @@ def ranges_bytes(node: int, second: int, peer: int, range_m: float) -> bytes:
     return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)
 
 
+def test_a_folder_whose_name_is_not_utf_8_is_fused_recorded_and_reported(tmp_path: Path) -> None:
+    run = a_run(Path(f"{tmp_path}/gebäude\udcff"), "1,1,2,3\n")
+    out, page = Path(f"{tmp_path}/out\udcff"), tmp_path / "report.html"
+    quick = ("--estimator", "deadreckoning")
+    for arguments in (
+        ("fuse", run, "--out", out, *quick),
+        ("report", run, "--out", page, *quick),
+        ("fuse", run, "--record", tmp_path / "r.mcap", "--out", tmp_path / "again", *quick),
+    ):
+        result = relpos(*arguments)
+        assert result.exit_code == 0, result.output
+    for written in (out / "index.html", page):
+        assert "<title>gebäude?" in written.read_text()
+
+
 @pytest.mark.soak  # tests/system/test_chain.py interrupts a longer session
 def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()

@@ -305,6 +305,15 @@ def test_a_line_of_the_log_whose_time_is_none_is_left_out_of_the_files(tmp_path,
     assert "to be kept" in path.read_text()
 
 
+def test_a_mission_s_name_can_be_shown_and_written_whatever_its_folder_is_called(tmp_path):
+    path = Path(f"{tmp_path}/mühle\udcff")
+    assert Mission.open(path, "/dev/null").about.name == "mühle?"
+    assert Mission.open(path, name="new\udcff").about.name == "new?"
+    found = vars(Mission.open(path).about) | {"name": "\ud800"}
+    (path / "mission.json").write_text(json.dumps(found))
+    assert Mission.open(path).about.name == "?"
+
+
 def test_a_device_stays_shut_out_after_a_week(tmp_path):
     mission = Mission.open(tmp_path / "m", "/dev/null")
     event = {"kind": "device", "id": "a", "action": "shut", "time_s": 9e5, "unix_s": 1.7e9}

@@ -215,13 +215,14 @@ def _recorders(
 
 def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
     """Return all that a replay needs beside the received bytes, except for the key."""
+    from relpos.files import displayable
     from relpos.recording.about import About
     from relpos.runs import InitialPose
 
     link = source.link
     return About(
         round(hello.started_unix_s * 1e9),
-        source=source.name,
+        source=displayable(source.name),
         estimator=plan.estimator,
         settings=plan.settings,
         seed=plan.seed,

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.files import write_whole
+from relpos.files import displayable, write_whole
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.live.fusion_thread import known_poses
 from relpos.live.inputs import Received
@@ -127,7 +127,7 @@ class Mission:
             except (ValueError, KeyError) as error:
                 raise DataError(f"{path}: not a mission's folder: {error}") from None
             about.source = source or about.source
-            about.name = name or about.name
+            about.name = displayable(name or about.name)
             return cls(path, about)
         if source is None:
             raise DataError(f"{path}: no mission (relpos mission begins one), nor a recording")
@@ -137,7 +137,7 @@ class Mission:
             raise DataError(f"{path}: neither a mission nor empty")
         path.mkdir(parents=True, exist_ok=True)
         _check_own_files(path)
-        mission = cls(path, About(name or path.name, source, time.time()))
+        mission = cls(path, About(displayable(name or path.name), source, time.time()))
         assert mission.key
         mission.save()
         return mission

@@ -11,6 +11,7 @@ from relpos.evaluation.report import tables
 from relpos.evaluation.report.content import Content
 from relpos.evaluation.report.drawing import Picture, colours
 from relpos.evaluation.report.tables import Table
+from relpos.files import displayable
 from relpos.version import __version__
 
 Tables = tuple[Callable[[Content], Table | None], ...]
@@ -54,7 +55,7 @@ def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
             links.append(f'<li><a href="#{key}">{escape(title)}</a></li>')
     light, dark = colours()
     numbers = json.dumps(content.as_json(), allow_nan=False).replace("</", "<\\/")
-    return _PAGE.format(
+    document = _PAGE.format(
         title=escape(content.run.name),
         style=_CSS.replace("LIGHT", light).replace("DARK", dark),
         subtitle=_subtitle(content),
@@ -66,6 +67,8 @@ def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
         numbers=numbers,
         version=__version__,
     )
+    # A run has the name of its folder, which need not be UTF-8.
+    return displayable(document)
 
 
 def _figure(picture: Picture, svg: str) -> str:
