@@ -25,13 +25,10 @@ from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
-from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
+from relpos.runs.run import RECEIVED, TABLE_NAMES, Run, load_run, save_run
 from relpos.runs.table import find_table, remove_table
 
 _Written = tuple[list[Path], list[str]]
-
-RECEIVED = "received"
-"""Folder in which ``relpos fuse PORT`` stores the run of its estimates."""
 
 _ESTIMATE_TABLES = (
     "estimate.csv",
