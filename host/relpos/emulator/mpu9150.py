@@ -111,11 +111,13 @@ def _filtered(
     By LAPACK: to import scipy.signal takes longer than a minute of a node.
     """
     b, a = _filter(bandwidth_hz)
+    raw = np.asfortranarray(raw)
     driven = b[0] * raw
     driven[1:] += b[1] * raw[:-1]
     driven[2:] += b[2] * raw[:-2]
     driven[:2] += state
-    rows: FloatArray = dtbtrs(np.repeat(a[:, None], len(raw), 1), driven, uplo="L", diag="U")[0]
+    bands = np.tile(a, (len(raw), 1)).T
+    rows: FloatArray = dtbtrs(bands, driven, uplo="L", diag="U", overwrite_b=1)[0]
     return rows, np.array(
         (
             b[1] * raw[-1] - a[1] * rows[-1] + b[2] * raw[-2] - a[2] * rows[-2],
@@ -176,7 +178,8 @@ class _Pipeline:
         steps = np.arange(begin, end)
         times = np.asarray(steps * self.step_s - config[2], dtype=np.float64)
         true = self._surroundings.inertial_at(times)
-        rows: FloatArray = true @ self._gain + self._bias
+        rows: FloatArray = true @ self._gain
+        rows += self._bias
         if self._sigma.any() or self._errors.gyroscope_walk_rad_s_rts:
             for number in range(begin // _BLOCK_STEPS, (end - 1) // _BLOCK_STEPS + 1):
                 first = number * _BLOCK_STEPS
@@ -188,7 +191,8 @@ class _Pipeline:
     def _noise(self, number: int) -> FloatArray:
         # A block before power-on (number -1) has its own noise but no walk.
         rng = np.random.default_rng([self._errors.seed, 2, number + 1])
-        noise: FloatArray = rng.standard_normal((_BLOCK_STEPS, 6)) * self._sigma
+        noise: FloatArray = rng.standard_normal((_BLOCK_STEPS, 6))
+        noise *= self._sigma
         walk = self._errors.gyroscope_walk_rad_s_rts * np.sqrt(_BLOCK_STEPS * self.step_s)
         while len(self._walk) < number + 2:
             self._walk.append(self._walk[-1] + walk * self._walk_rng.standard_normal(3))

@@ -66,17 +66,15 @@ class Surroundings:
         position = np.clip(time_s * self.rate_hz, 0.0, len(rows) - 1.0)
         below = np.minimum(position.astype(np.int64), max(len(rows) - 2, 0))
         f = (position - below)[:, None]
-        last = len(rows) - 1
-        before = rows[np.maximum(below - 1, 0)]
-        here = rows[below]
-        after = rows[np.minimum(below + 1, last)]
-        behind = rows[np.minimum(below + 2, last)]
-        result: FloatArray = (
-            before * (-f * (f - 1.0) * (f - 2.0) / 6.0)
-            + here * ((f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0)
-            + after * (-(f + 1.0) * f * (f - 2.0) / 2.0)
-            + behind * ((f + 1.0) * f * (f - 1.0) / 6.0)
+        weights = (
+            -f * (f - 1.0) * (f - 2.0) / 6.0,
+            (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0,
+            -(f + 1.0) * f * (f - 2.0) / 2.0,
+            (f + 1.0) * f * (f - 1.0) / 6.0,
         )
+        result = np.zeros((len(f), 6))
+        for offset, weight in enumerate(weights, -1):
+            result += rows.take(below + offset, axis=0, mode="clip") * weight
         return result
 
 
