@@ -59,6 +59,7 @@ class Ak8975(I2cDevice):
         self._surroundings = surroundings
         self._errors = errors or MagneticErrors()
         self._reachable = reachable
+        self._gain = (np.array(self._errors.adjustment) + 128.0) / 256.0
         self._rng = np.random.default_rng([self._errors.seed, 3])
         self.time_us = 0
         self.conversion_us = CONVERSION_US
@@ -101,14 +102,12 @@ class Ak8975(I2cDevice):
             chip = np.array(SELF_TEST_UT)
         noise = self._errors.noise_ut * self._rng.standard_normal(3)
         chip = self._errors.soft_iron @ chip + self._errors.bias_ut + noise
-        if not np.all(np.isfinite(chip)):
+        if not np.isfinite(chip).all():
             # A recording without magnetometer samples here: the conversion never ends.
             return
         chip = self.spoil(chip)
-        gain = (np.array(self._errors.adjustment) + 128.0) / 256.0
-        counts = np.rint(chip / (self.ut_per_lsb * gain))
-        raw = np.clip(counts, -self.most_raw - 1, self.most_raw)
-        self._data = raw.astype("<i2").tobytes()
+        counts = np.rint(chip / (self.ut_per_lsb * self._gain))
+        self._data = counts.clip(-self.most_raw - 1, self.most_raw).astype("<i2").tobytes()
         self._st1 = DATA_READY
         self._st2 = OVERFLOW if np.abs(chip).sum() >= self.overflow_ut else 0
 

@@ -216,8 +216,9 @@ class Mpu9150(I2cDevice):
         auxiliary: Mapping[int, I2cDevice] | None = None,
     ) -> None:
         self._surroundings = surroundings
-        self._errors = errors or InertialErrors()
-        self._pipeline = _Pipeline(surroundings, self._errors)
+        errors = errors or InertialErrors()
+        self._clock = 1.0 + errors.sample_clock_ppm * 1e-6
+        self._pipeline = _Pipeline(surroundings, errors)
         self.auxiliary: Mapping[int, I2cDevice] = {} if auxiliary is None else auxiliary
         self.spoil: Callable[[bytes, int], bytes | None] = lambda data, _time_us: data
         """Fault: (a sample's 14 bytes, its time) -> what is shown for it; None: no new sample."""
@@ -268,8 +269,7 @@ class Mpu9150(I2cDevice):
     # -- sampling ---------------------------------------------------------------------------
 
     def _ticks_at(self, time_us: int) -> int:
-        clock = 1.0 + self._errors.sample_clock_ppm * 1e-6
-        return int(time_us * 1e-6 * _TICKS_PER_S * clock + 1e-6)
+        return int(time_us * 1e-6 * _TICKS_PER_S * self._clock + 1e-6)
 
     def _reschedule(self) -> None:
         """Configuration changed: samples are counted anew from here."""
@@ -295,8 +295,7 @@ class Mpu9150(I2cDevice):
 
     def _time_of(self, sample: int) -> int:
         """First whole microsecond at which ``sample`` is there."""
-        clock = 1.0 + self._errors.sample_clock_ppm * 1e-6
-        exact = (self._epoch + sample * self._period) * 1e6 / (_TICKS_PER_S * clock)
+        exact = (self._epoch + sample * self._period) * 1e6 / (_TICKS_PER_S * self._clock)
         return int(exact) + 1
 
     def advance(self, time_us: int) -> None:
@@ -540,25 +539,15 @@ class Mpu9150(I2cDevice):
 
     def transfer(self, first: bytes, second: bytes, read_count: int) -> tuple[BusStatus, bytes]:
         """As the bytes would do; the two transactions of every tick without going through them."""
-        if len(first) == 1 and not second:
+        if len(first) == 1 and not self._registers[INT_PIN_CFG] & CLEAR_ON_ANY_READ:
             register = first[0]
-            clear = self._registers[INT_PIN_CFG] & CLEAR_ON_ANY_READ
-            if register == ACCEL_XOUT_H and read_count <= 14:
-                self._pointer = register + read_count
-                if clear:
-                    self._status = 0
-                return BusStatus.OK, self._data[:read_count]
-            if register == INT_PIN_CFG and read_count == 18:
+            behind = register + read_count
+            if INT_PIN_CFG <= register <= INT_STATUS < behind <= EXT_SENS_DATA and not second:
                 status = self._status & self._registers[INT_ENABLE]
                 self._status = 0
-                self._pointer = register + read_count
-                head = self._registers[INT_PIN_CFG:INT_STATUS]
-                return BusStatus.OK, bytes((*head, status)) + self._data
-            if register == INT_STATUS and 1 <= read_count <= 15:
-                status = self._status & self._registers[INT_ENABLE]
-                self._status = 0
-                self._pointer = register + read_count
-                return BusStatus.OK, bytes((status,)) + self._data[: read_count - 1]
+                self._pointer = behind
+                data = bytes((*self._registers[register:INT_STATUS], status))
+                return BusStatus.OK, data + self._data[: behind - ACCEL_XOUT_H]
         return super().transfer(first, second, read_count)
 
 
