@@ -176,7 +176,6 @@ class NativeEngine:
         self._error: BaseException | None = None
         self._reset_asked = False
         self._line_free_us = 0
-        self._now_us = power_on_us
         self._supply_mv = 5000
         # Kept alive here: ctypes does not.
         self._callbacks = _Callbacks(
@@ -196,16 +195,11 @@ class NativeEngine:
             len(self._eeprom),
             self._given_id,
             int(cause),
-            self._node_us(self._power_on_us),
+            self._bend_node_us & 0xFFFFFFFF,
         )
         if not self._node:
             raise DeviceError(f"node {self.node_id}: the firmware refuses to start")
         self._library.relpos_node_set_supply(self._node, self._supply_mv)
-
-    def _node_us(self, time_us: int) -> int:
-        """Node clock, 32 bits: from the offset at power-on, from 0 after a reset."""
-        since_us = int((time_us - self._bend_us) * self._rate)
-        return (since_us + self._bend_node_us) & 0xFFFFFFFF
 
     # -- called by the firmware -----------------------------------------------------------------
 
@@ -223,8 +217,8 @@ class NativeEngine:
         try:
             status, data = self.bus.transfer(
                 address,
-                ctypes.string_at(first, first_count) if first_count and first else b"",
-                ctypes.string_at(second, second_count) if second_count and second else b"",
+                ctypes.string_at(first, first_count) if first else b"",
+                ctypes.string_at(second, second_count) if second else b"",
                 read_count,
             )
             if data and read:
@@ -237,7 +231,7 @@ class NativeEngine:
     def _written(self, _context: int | None, data: int | None, count: int) -> None:
         try:
             if data and count:
-                begin = max(self._now_us, self._line_free_us)
+                begin = max(self.bus.time_us, self._line_free_us)
                 self._line_free_us = begin + line_time_us(count, UART_BAUD)
                 self.on_transmit(self._line_free_us, ctypes.string_at(data, count))
         except BaseException as error:
@@ -252,7 +246,7 @@ class NativeEngine:
             self._written_at = at
             # A fault that stores something else has cut the supply itself.
             intact = self._eeprom[at] == value
-            self._written_until_us = self._now_us + EEPROM_WRITE_US if intact else 0
+            self._written_until_us = self.bus.time_us + EEPROM_WRITE_US if intact else 0
         except BaseException as error:
             self._error = error
 
@@ -264,28 +258,28 @@ class NativeEngine:
     def run(self, until_us: int) -> None:
         """Make every pass that is due by ``until_us``: some 400 a second."""
         while (time_us := self.next_due_us) <= until_us:
-            wait_us = self.poll(time_us, self._node_us(time_us))
+            since_us = int((time_us - self._bend_us) * self._rate)
+            wait_us = self.poll(time_us, since_us + self._bend_node_us & 0xFFFFFFFF)
             if self._reset_asked:
                 self.reset(time_us, ResetCause.COMMAND)
             elif wait_us < LOOP_US:
                 self.next_due_us = time_us + LOOP_US
             else:
-                self.next_due_us = self._after(time_us, wait_us)
+                self.next_due_us = self._time_of(since_us + wait_us)
 
     def poll(self, time_us: int, node_us: int) -> int:
         """One pass of the main loop with the node's clock at ``node_us``; what it returns."""
-        self._now_us = self.bus.time_us = time_us
+        self.bus.time_us = time_us
         wait_us: int = self._poll(self._node, node_us)
         if self._error is not None:
             error, self._error = self._error, None
             raise error
         return wait_us
 
-    def _after(self, time_us: int, wait_us: int) -> int:
-        """First virtual microsecond at which the node's clock, truncated, has gone that far."""
-        due_node_us = int((time_us - self._bend_us) * self._rate) + wait_us
-        since_us = int(due_node_us / self._rate)
-        while int(since_us * self._rate) < due_node_us:
+    def _time_of(self, node_us: int) -> int:
+        """First virtual microsecond at which the node's clock has gone that far since its bend."""
+        since_us = int(node_us / self._rate)
+        while int(since_us * self._rate) < node_us:
             since_us += 1
         return self._bend_us + since_us
 
