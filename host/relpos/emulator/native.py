@@ -30,6 +30,8 @@ LOOP_US = 200
 """Shortest time of one pass of the main loop, where the firmware wants the next at once: about
 what the Uno needs for an idle pass with its interrupts. Without it virtual time would stand."""
 EEPROM_BYTES = 1024
+WIRE_BYTES = 510
+"""Room for the two parts of a transaction of the bus (engine.h)."""
 UART_BAUD = 38_400
 
 _U8 = ctypes.c_uint8
@@ -38,7 +40,7 @@ _U32 = ctypes.c_uint32
 _POINTER = ctypes.c_void_p
 
 # Plain addresses instead of POINTER(c_uint8): making pointer objects costs more than the chips do.
-_I2cTransfer = ctypes.CFUNCTYPE(_U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8)
+_I2cTransfer = ctypes.CFUNCTYPE(_U8, _POINTER, _U8, _U8, _U8, _U8)
 _UartWrite = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _U16)
 _Reset = ctypes.CFUNCTYPE(None, _POINTER)
 _StorageWrite = ctypes.CFUNCTYPE(None, _POINTER, _U16, _U8)
@@ -48,6 +50,7 @@ class _Callbacks(ctypes.Structure):
     _fields_ = (
         ("context", _POINTER),
         ("i2c_transfer", _I2cTransfer),
+        ("wire", _POINTER),
         ("uart_write", _UartWrite),
         ("reset", _Reset),
         ("storage_write", _StorageWrite),
@@ -178,9 +181,12 @@ class NativeEngine:
         self._line_free_us = 0
         self._supply_mv = 5000
         # Kept alive here: ctypes does not.
+        wire = (_U8 * WIRE_BYTES)()
+        self._wire = memoryview(wire).cast("B")
         self._callbacks = _Callbacks(
             None,
             _I2cTransfer(self._transfer),
+            ctypes.addressof(wire),
             _UartWrite(self._written),
             _Reset(self._asked),
             _StorageWrite(self._stored),
@@ -204,25 +210,18 @@ class NativeEngine:
     # -- called by the firmware -----------------------------------------------------------------
 
     def _transfer(
-        self,
-        _context: int | None,
-        address: int,
-        first: int | None,
-        first_count: int,
-        second: int | None,
-        second_count: int,
-        read: int | None,
-        read_count: int,
+        self, _context: int | None, address: int, first: int, second: int, read_count: int
     ) -> int:
+        wire = self._wire
         try:
             status, data = self.bus.transfer(
                 address,
-                ctypes.string_at(first, first_count) if first else b"",
-                ctypes.string_at(second, second_count) if second else b"",
+                wire[:first].tobytes(),
+                wire[first : first + second].tobytes() if second else b"",
                 read_count,
             )
-            if data and read:
-                ctypes.memmove(read, data, read_count)
+            if data:
+                wire[:read_count] = data
         except BaseException as error:  # ctypes would print it and go on
             self._error = error
             return int(BusStatus.TIMEOUT)

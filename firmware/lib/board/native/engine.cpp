@@ -2,6 +2,8 @@
 
 #if !defined(ARDUINO)
 
+#include <string.h>
+
 #include <new>
 
 #include "board/board.h"
@@ -80,8 +82,11 @@ class NativeBoard final : public Board {
   BusStatus i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                          const uint8_t* second, uint8_t second_count, uint8_t* read,
                          uint8_t read_count) override {
-    const uint8_t status = callbacks_.i2c_transfer(callbacks_.context, address, first, first_count,
-                                                   second, second_count, read, read_count);
+    memcpy(callbacks_.wire, first, first_count);
+    if (second_count != 0) memcpy(callbacks_.wire + first_count, second, second_count);
+    const uint8_t status = callbacks_.i2c_transfer(callbacks_.context, address, first_count,
+                                                   second_count, read_count);
+    if (status == 0 && read_count != 0) memcpy(read, callbacks_.wire, read_count);
     return status <= static_cast<uint8_t>(BusStatus::kTimeout) ? static_cast<BusStatus>(status)
                                                                : BusStatus::kTimeout;
   }
@@ -121,8 +126,9 @@ relpos_node* relpos_node_create(const relpos_board_callbacks* callbacks, uint8_t
                                 uint16_t eeprom_size, uint8_t node_id, uint8_t reset_cause,
                                 uint32_t now_us) {
   if (callbacks == nullptr || callbacks->i2c_transfer == nullptr ||
-      callbacks->uart_write == nullptr || callbacks->reset == nullptr || eeprom == nullptr ||
-      eeprom_size < relpos::kStorageBytes || node_id == relpos::wire::kBroadcast) {
+      callbacks->wire == nullptr || callbacks->uart_write == nullptr ||
+      callbacks->reset == nullptr || eeprom == nullptr || eeprom_size < relpos::kStorageBytes ||
+      node_id == relpos::wire::kBroadcast) {
     return nullptr;
   }
   relpos_node* node = new (std::nothrow) relpos_node(*callbacks, eeprom, eeprom_size, now_us);

@@ -12,11 +12,12 @@ typedef struct relpos_node relpos_node;
 
 typedef struct {
   void* context; /* handed back in every call */
-  /* S address+W first [Sr address+W second] [Sr address+R read] P.
+  /* S address+W first [Sr address+W second] [Sr address+R read] P: first, and second behind it, are
+   * in wire; what is read is put there. One buffer, as following pointers costs Python much time.
    * Returns 0 ok, 1 address nack, 2 data nack, 3 timeout or bus stuck. */
-  uint8_t (*i2c_transfer)(void* context, uint8_t address, const uint8_t* first,
-                          uint8_t first_count, const uint8_t* second, uint8_t second_count,
-                          uint8_t* read, uint8_t read_count);
+  uint8_t (*i2c_transfer)(void* context, uint8_t address, uint8_t first_count,
+                          uint8_t second_count, uint8_t read_count);
+  uint8_t* wire; /* 510 bytes, the caller's; they must outlive the node */
   /* Bytes leaving the node, at the end of a poll; the line's speed is the caller's to model. */
   void (*uart_write)(void* context, const uint8_t* bytes, uint16_t count);
   /* The node asked to reboot: destroy it after the poll has returned and create it anew with reset

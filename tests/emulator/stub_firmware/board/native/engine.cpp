@@ -55,14 +55,11 @@ uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us) {
     if (node->inbox[0] == 'W') node->eeprom[0] = node->inbox[1];
     if (node->inbox[0] == 'H') node->hasty = true;
     if (node->inbox[0] == 'T') {
-      const uint8_t reg = 3;
       out[n++] = 'I';
-      out[n] = 0;
-      const uint8_t status =
-          node->board.i2c_transfer(node->board.context, 0x50, &reg, 1, nullptr, 0, out + n + 1, 1);
-      out[n] = status;
-      if (status) out[n + 1] = 0;
-      n += 2;
+      node->board.wire[0] = 3;
+      const uint8_t status = node->board.i2c_transfer(node->board.context, 0x50, 1, 0, 1);
+      out[n++] = status;
+      out[n++] = status ? 0 : node->board.wire[0];
     }
     node->count = 0;
   }
