@@ -21,7 +21,8 @@ from .pozyx import (
 )
 from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, Transmission, XbeeModule
 
-Action = Callable[[int], None]
+Action = Callable[[int], int | None]
+"""(time) -> when it is to be called again, or None."""
 
 STEP_US = 20_000
 """How far a team's clock advances between two looks at its serial port."""
@@ -48,11 +49,16 @@ class VirtualClock:
     def run(self, until_us: int) -> None:
         """Carry out everything due by ``until_us``; then that is the time."""
         heap = self._heap
-        pop = heapq.heappop
         while heap and heap[0][0] <= until_us:
-            time_us, _, action = pop(heap)
+            time_us, _, action = heap[0]
             self.now_us = time_us
-            action(time_us)
+            again_us = action(time_us)
+            # What it has asked for stands behind it: it is still the first.
+            if again_us is None:
+                heapq.heappop(heap)
+            else:
+                self._asked += 1
+                heapq.heapreplace(heap, (again_us, self._asked, action))
         self.now_us = max(self.now_us, until_us)
 
 

@@ -166,13 +166,13 @@ class EmulatedNode:
         self._due_us = max(self.engine.next_due_us, clock.now_us)
         clock.at(self._due_us, self._run)
 
-    def _run(self, now_us: int) -> None:
+    def _run(self, now_us: int) -> int | None:
         if now_us != self._due_us:
-            return  # another pass was asked for in between
+            return None  # another pass was asked for in between
         engine = self.engine
         engine.run(now_us)
         self._due_us = engine.next_due_us
-        self._clock.at(self._due_us, self._run)
+        return self._due_us
 
     def _from_radio(self, left_us: int, data: bytes) -> None:
         # An AVR's engine paces the bytes on its line itself, from the first one on.
