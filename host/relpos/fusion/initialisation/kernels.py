@@ -39,7 +39,7 @@ SCALE_VARIANCE, BIAS_VARIANCE_M2 = 0.2**2, 0.3**2
 
 OUTLIER_FRACTION = 0.05
 OUTLIER_VARIANCE_M2 = 9.0
-"""Outlier mixture: 5 % with 3 m, as everywhere."""
+"""Outlier mixture: 5 % with 3 m."""
 
 _TINY = 1e-12
 
