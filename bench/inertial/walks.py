@@ -29,7 +29,7 @@ LOOP_M = 1.0  # ends nearer to the beginning than this are a loop
 LOST_TURN_DEG = 30.0  # less than a U-turn by this: nobody leaves a corridor so, samples are missing
 SETTLE_S = 1.0  # over which a heading is averaged: a stride
 CALIBRATED_SIGMA = 0.05  # scale error left after one calibration walk
-IRREGULAR = 1 << 5  # flag of the library: a step was doubtful or irregular, last two seconds
+IRREGULAR = 1 << 8  # flag of the library: a step was doubtful or irregular, last two seconds
 
 # Who walked: what a folder's name says of it. Other sets have a person a run.
 PEOPLE = {

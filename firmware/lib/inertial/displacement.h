@@ -13,8 +13,8 @@ enum QualityFlag : uint16_t {
   kAngularRateSaturated = 1u << 1,   // within the last two seconds
   kMagneticDisturbed = 1u << 2,      // the last magnetometer reading was rejected
   kForwardUnknown = 1u << 3,         // forward axis not found yet: steps go along the heading axis
-  kBadInput = 1u << 4,               // a sample or dt was refused within the last two seconds
-  kStepDoubtful = 1u << 5            // a step contradicted the inertial motion, last two seconds
+  kBadInput = 1u << 6,               // a sample or dt was refused within the last two seconds
+  kStepDoubtful = 1u << 8            // a step contradicted the inertial motion, last two seconds
 };
 
 // Running totals since the reset, in the wearer's heading frame at the reset: x forward, y left.
