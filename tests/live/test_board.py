@@ -119,6 +119,16 @@ def test_a_value_of_the_wrong_type_is_refused_in_plain_words(bad, words):
     assert board == Board()
 
 
+def test_a_marker_is_set_once_and_nobody_changes_its_sign_or_moves_it():
+    board = Board()
+    marker = {"action": "set", "id": "haz", "x_m": 1.0, "y_m": 2.0}
+    board.apply(event("marker", sign="hazard", **marker))
+    assert board.apply(event("marker", sign="hazard", **marker | {"x_m": 90.0})) is None
+    with pytest.raises(BoardError, match="id: another marker has it"):
+        board.apply(event("marker", sign="exit", by="Chief", **marker))
+    assert (board.markers["haz"].sign, board.markers["haz"].x_m) == ("hazard", 1.0)
+
+
 @pytest.mark.parametrize("within_s", [600, 600.0, "600"])
 def test_the_time_of_a_roll_call_may_be_any_numeral(within_s):
     board = Board()

@@ -368,6 +368,22 @@ def test_a_request_is_taken_as_the_kind_that_its_device_was_allowed(kind):
     assert not getattr(phones, "board", {}).get("evacuation")
 
 
+def test_a_mayday_that_is_called_again_leaves_the_answers_of_the_roll_call():
+    with EmulatedTeam(TeamConfig("straight", 3, 16.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        answer = {"action": "answer", "node": 2, "answer": "confirmed"}
+        phones = Phones(
+            source,
+            (8.0, Request(1, "mayday", 8.0, {"node": 1, "on": True})),
+            (10.0, Request(2, "rollcall", 10.0, answer)),
+            (12.0, Request(3, "mayday", 12.0, {"node": 1, "on": True})),
+        )
+        session, _ = make_session(source, deadreckoning, phones)
+        run_through(session)
+    assert phones.board["roll_call"]["emergency"]
+    assert list(phones.board["roll_call"]["answers"]) == [2]
+
+
 def test_a_port_that_vanishes_is_told_where_nothing_is_shown(tmp_path):
     remarks = []
     with EmulatedTeam(TeamConfig("straight", 2, 12.0, 3, beacons=True)) as team:

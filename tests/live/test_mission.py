@@ -144,6 +144,23 @@ def test_a_session_that_was_killed_goes_on_with_the_same_map_names_and_alarms(tm
         assert min(e.time_s for e in album.estimates) > again.since_s
 
 
+def test_what_a_request_says_beside_its_own_is_dropped_and_costs_it_nothing(tmp_path):
+    mission = Mission.open(tmp_path / "mill", "emulated")
+    with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
+        source, visitors = TeamInput(team), Visitors()
+        resumed = mission.resume()
+        resumed.priors = tuple(team.priors())
+        session, _, _ = made(team, source, resumed, mission, visitors)
+        visitors.ask("mayday", node=1, on=True, said=1, seconds="x", unix_s="now")
+        visitors.ask("board", node=2, state="standby", name=3, text="x" * 4000)
+        play(session, lambda: len(visitors.answers) == 2 and source.now_s() > 5.0)
+        session.finish()
+    assert [status for *_, status in visitors.answers] == [200, 200]
+    kept = {event["kind"]: event for event in Mission.open(tmp_path / "mill").events()}
+    assert kept["mayday"]["node"] == 1
+    assert kept["board"].keys() == {"kind", "node", "nodes", "state", "by", "time_s", "unix_s"}
+
+
 def test_an_event_is_confirmed_once_the_disk_has_it(tmp_path, monkeypatch):
     path = tmp_path / JOURNAL
     full = True

@@ -116,6 +116,9 @@ def test_devices_keep_their_token_and_role_over_a_restart(mill: list[Mill]) -> N
     assert tries == [200, 200, 403, 401]
     tries = [page.ask("GET", "/api/devices", who).status_code for who in (commander, phone, viewer)]
     assert tries == [200, 403, 403]
+    # Each would let in one more phone.
+    tries = [page.ask("GET", "/qr.svg", who).status_code for who in (phone, viewer)]
+    assert tries == [403, 403]
     page = mill[0] = page.restarted()
     for who in (commander, phone, viewer):
         assert page.ask("GET", "/api/time", who).status_code == 200

@@ -47,7 +47,16 @@ STATE_WORDS = {
     "withdrawing": Said("withdrawing", "{whom}state withdrawing", whom=""),
     "out": Said("out", "{whom}state out", whom=""),
 }
-BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate", "marker", "plan", "floor")
+BOARD_EVENTS: Mapping[str, tuple[str, ...]] = {
+    "board": ("node", *TEXTS, "state", "air_bar"),
+    "rollcall": ("action", "node", "nodes", "answer", "within_s", "emergency"),
+    "mayday": ("node", "on"),
+    "evacuate": ("action", "node", "nodes"),
+    "marker": ("action", "id", "sign", "x_m", "y_m", "node"),
+    "plan": ("action", "image", "points"),
+    "floor": ("floor", "name"),
+}
+"""Kind -> what a request of it may say; who asks is added."""
 EDITS = {
     "team": Said("edit-team", "team {text}", text=""),
     "sector": Said("edit-sector", "sector {text}", text=""),
@@ -251,16 +260,20 @@ class Board:
             confirmed=said.count("confirmed"), missing=said.count("missing"), called=len(said)
         )
 
-    def _marker(self, event: Mapping[str, Any]) -> Said:
+    def _marker(self, event: Mapping[str, Any]) -> Said | None:
         name = event["id"]
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_TEXT:
-            raise BoardError(f"id: not 1 to {MAX_TEXT} characters")
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_TEXT or not name.isprintable():
+            raise BoardError(f"id: not 1 to {MAX_TEXT} printable characters")
         if event.get("action") == "remove":
             if self.markers.pop(name, None) is None:
                 raise BoardError(Said("no-marker", "no such marker"))
             return Said("unmarked", "{whom}marker removed", whom="")
         if event.get("sign") not in list(SIGNS) or event.get("action") != "set":
             raise BoardError(f"sign: none of {', '.join(SIGNS)}")
+        if name in self.markers:
+            if self.markers[name].sign != event["sign"]:
+                raise BoardError("id: another marker has it")
+            return None  # Asked again, as a phone does that has had no answer.
         if len(self.markers) >= MOST_MARKERS:
             raise BoardError(Said("many-markers", "more than {most} markers", most=MOST_MARKERS))
         x_m, y_m = _numbers([event.get("x_m"), event.get("y_m")])

@@ -489,18 +489,20 @@ class LiveSession:
 
     def _change_board(self, kind: str, body: dict[str, Any]) -> tuple[dict[str, object], int]:
         everybody = sorted(self._composer.monitor.nodes.keys() - self._composer.posts)
-        body = {"by": "", "nodes": everybody, **body}
+        said = {name: body[name] for name in BOARD_EVENTS[kind] if name in body}
+        body = {"nodes": everybody, **said, "by": body.get("by", "")}
         if kind == "marker" and "x_m" not in body and body.get("action") == "set":
             # "Here", of a wearer's phone.
             at = self._composer.nowcast.node(body.get("node", 0))
             if at is None or at.status not in (NodeStatus.OK, NodeStatus.STALE):
                 return refusal(Said("where", "where you are is not known yet")), 409
             body |= {"x_m": at.x_m, "y_m": at.y_m}
+        again = kind == "mayday" and body.get("node") in self._board.mayday
         try:
             self._happen({**body, "kind": kind})
         except BoardError as error:
             return refusal(error.args[0]), 400
-        if kind == "mayday" and body.get("on"):
+        if kind == "mayday" and body.get("on") and not again:
             # Who else is in trouble is asked at once.
             start = {"action": "start", "emergency": True, "within_s": 300.0}
             self._happen({"kind": "rollcall", "by": body["by"], "nodes": everybody, **start})

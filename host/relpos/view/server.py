@@ -169,9 +169,9 @@ class SessionProxy:
         """Hand a request on; the session's answer, None where none comes in time."""
         self._asked += 1
         number = self._asked
+        line = to_json({"id": number, "kind": kind, "unix_s": time.time(), "body": body})
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
         self._answers[number] = answer
-        line = to_json({"id": number, "kind": kind, "unix_s": time.time(), "body": body})
         try:
             async with asyncio.timeout(ANSWER_S):
                 self._out.write(line.encode() + b"\n")
