@@ -127,6 +127,14 @@ def test_calibration_needs_rest_and_the_accelerometer_needs_sides():
     assert not guide.progress(samples_of(("still", "turn"))[0]).done(with_magnetometer=True)
 
 
+def test_what_was_not_measured_stays_as_it_was_calibrated():
+    calibrated = guide.solve(samples_of(("still", "sides", "turn"))[0]).calibration
+    result = guide.solve(samples_of(("still",))[0], calibrated, with_magnetometer=False)
+    assert result.accelerometer is None
+    for name in ("acceleration_bias_m_s2", "acceleration_scale", "field_offset_ut", "field_matrix"):
+        assert np.array_equal(getattr(result.calibration, name), getattr(calibrated, name))
+
+
 def test_a_node_that_is_held_is_not_lying_still():
     time_s = np.arange(50) * 0.2
     swaying = np.radians(2.0) * np.sin(time_s)[:, None] * np.ones(3)

@@ -514,6 +514,15 @@ def test_a_run_that_was_not_simulated_is_not_replaced_by_one_that_is(
     assert again.exit_code == 0, again.output
 
 
+def test_dead_reckoning_does_not_replace_the_recording_that_it_reads(tmp_path: Path) -> None:
+    rows = "".join(f"{k / 50.0},1,0,0,9.81,0,0,0\n" for k in range(60))
+    header = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s\n"
+    (tmp_path / "imu.csv").write_text(header + rows)
+    refused = one_clear_line(relpos("deadreckon", tmp_path, "--out", tmp_path))
+    assert "holds a run that was not dead-reckoned" in refused
+    assert (tmp_path / "imu.csv").read_text() == header + rows
+
+
 @pytest.mark.parametrize("name", ["imu.csv", "landmarks.csv"])
 def test_a_recording_of_one_table_is_not_replaced_by_a_simulation(
     tmp_path: Path, name: str

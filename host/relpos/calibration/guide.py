@@ -106,8 +106,13 @@ class Result:
     """What was not calibrated, and why."""
 
 
-def solve(samples: Sequence[RawSample], *, with_magnetometer: bool = True) -> Result:
-    """Fit gyroscope, accelerometer and magnetometer.
+def solve(
+    samples: Sequence[RawSample],
+    before: SensorCalibration | None = None,
+    *,
+    with_magnetometer: bool = True,
+) -> Result:
+    """Fit gyroscope, accelerometer and magnetometer; what is not fitted stays as ``before``.
 
     DataError, with a remedy, where the node never lay still or the magnetometer cannot be fitted;
     with too few attitudes the accelerometer stays as it is, with a remark.
@@ -127,7 +132,8 @@ def solve(samples: Sequence[RawSample], *, with_magnetometer: bool = True) -> Re
         )
     except DataError as error:
         remarks.append(f"accelerometer not calibrated: {error}")
-    still = SensorCalibration(
+    still = replace(
+        before or SensorCalibration(),
         gyro_bias_rad_s=gyro.bias_rad_s,
         gyro_bias_sigma_rad_s=gyro.sigma_rad_s,
         **(

@@ -62,6 +62,7 @@ def deadreckon(
             raise DataError(f"{path}: no inertial data in this run (imu.csv)")
         walks.append(walk)
     if out is not None:
+        output.keep_recording(out, "deadreckon", "dead-reckoned")
         output.check_folder(out)
     with output.working("running the firmware over the recording"):
         played = reckon_run(recording, board=str(board), stature_m=stature, calibration=walks)

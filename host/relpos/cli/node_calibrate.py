@@ -82,8 +82,10 @@ def sensors(
     key_file: KeyFile = None,
 ) -> None:
     """Calibrate gyroscope, accelerometer and magnetometer; `calibrate PORT` for short."""
-    if out is not None and magnetometer:
-        extras.require("report")
+    if out is not None:
+        output.check_folder(out)
+        if magnetometer:
+            extras.require("report")
     with connect(port, node, key_file) as dialogue:
         _sensors(dialogue, seconds, magnetometer, out, yes)
 
@@ -215,7 +217,7 @@ def _sensors(
                 if now.done(with_magnetometer=magnetic):
                     break
     before = dialogue.read_calibration()
-    result = guide.solve(samples, with_magnetometer=magnetic)
+    result = guide.solve(samples, before, with_magnetometer=magnetic)
     for words in result.remarks:
         output.remark(words)
     _print_result(dialogue.node, result)

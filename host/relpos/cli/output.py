@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from relpos.errors import DataError
+from relpos.errors import DataError, RelposError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -86,6 +86,20 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
             raise typer.BadParameter(f"'{pair}' is not KEY=VALUE", param_hint="--set")
         settings[key.strip()] = value.strip()
     return settings
+
+
+def keep_recording(out: Path, command: str, made: str) -> None:
+    """Refuse to replace a run that ``command`` has not ``made``: nobody could make it again."""
+    from relpos.runs.description import read_description
+    from relpos.runs.run import TABLE_NAMES
+    from relpos.runs.table import find_table
+
+    if not any(find_table(out, name) for name in TABLE_NAMES):
+        return
+    described = out / "run.toml"
+    source = read_description(described).source if described.exists() else None
+    if not (source or "").startswith(f"relpos {command} "):
+        raise RelposError(f"{out}: holds a run that was not {made}: choose another --out")
 
 
 def check_folder(folder: Path) -> None:

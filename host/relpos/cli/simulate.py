@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from relpos.cli import output
-from relpos.errors import RelposError
 
 
 def simulate(
@@ -42,7 +41,7 @@ def simulate(
 
     if (scenario is None) == (recordings is None):
         raise typer.BadParameter("give either --scenario NAME or --recordings DIR DIR...")
-    _keep_recording(out)
+    output.keep_recording(out, "simulate", "simulated")
     output.check_folder(out)
     if recordings is not None:
         from relpos.emulator.recorded_team import record_team
@@ -58,17 +57,3 @@ def simulate(
         f"{len(run.motions)} motions and {len(run.ranges)} ranges of {len(run.node_ids)} nodes "
         f"written to {out}"
     )
-
-
-def _keep_recording(out: Path) -> None:
-    """Refuse to replace a run that was not simulated: nobody could make it again."""
-    from relpos.runs.description import read_description
-    from relpos.runs.run import TABLE_NAMES
-    from relpos.runs.table import find_table
-
-    if not any(find_table(out, name) for name in TABLE_NAMES):
-        return
-    described = out / "run.toml"
-    source = read_description(described).source if described.exists() else None
-    if not (source or "").startswith("relpos simulate "):
-        raise RelposError(f"{out}: holds a run that was not simulated: choose another --out")
