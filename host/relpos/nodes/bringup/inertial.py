@@ -232,11 +232,13 @@ def _lag_s(dialogue: NodeDialogue, bus: BusAccess, response: float) -> float:
         lag_s = 0.0  # where a repeated command makes the first look too late, it says nothing
         while begun is not None and before is not None:
             now = bus.transfer(ADDRESS, RATE_WORDS[0], read=2)
+            since_s = now.at_s - begun.at_s
+            if since_s > 1.0:
+                break
             if not now.answered:
                 continue
             value = int.from_bytes(now.data, "big", signed=True)
-            since_s = now.at_s - begun.at_s
-            if abs(value - before) > 0.5 * abs(response) or since_s > 1.0:
+            if abs(value - before) > 0.5 * abs(response):
                 break
             lag_s = since_s
         lags.append(lag_s)
