@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from relpos.cli import node_check
 from relpos.link.decoder import Acknowledged
 from relpos.nodes.bringup import bus_access, inertial
 from relpos.nodes.bringup.bus_access import BusAccess
@@ -51,3 +54,15 @@ def test_a_sensor_that_stops_answering_in_its_self_test_does_not_hold_the_check_
     bus = bus_of(node, monkeypatch)
     assert inertial._lag_s(node, bus, 1000.0) == 0.0  # type: ignore[arg-type]
     assert node.time_s < 10.0
+
+
+def test_a_self_test_that_is_not_answered_leaves_a_report_that_can_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    node = Node(lambda register, _transactions: register not in inertial.RATE_WORDS)
+    figures: dict[str, object] = {}
+    tests = inertial.self_tests(node, bus_of(node, monkeypatch), 0x71, figures)  # type: ignore[arg-type]
+    assert [finding.right for finding in tests] == [False, False]
+    node_check._write(tmp_path / "report.json", 1, [], figures)
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert written["figures"]["self_test_over_factory"] == [0.0, 0.0, 0.0, None, None, None]

@@ -195,7 +195,7 @@ def self_tests(
     moved = _read(bus) - before
     bus.write(ADDRESS, ACCEL_CONFIG, plain)
     ratios = moved / np.array([*factory[0], *factory[1]])
-    figures["self_test_over_factory"] = [float(ratio) for ratio in ratios]
+    figures["self_test_over_factory"] = [float(r) if math.isfinite(r) else None for r in ratios]
     if identity == MPU9150:
         good = np.abs(ratios - 1.0) < TOLERANCE_9150
     else:
