@@ -163,3 +163,10 @@ def test_a_restart_whose_cause_the_boot_loader_hides_is_reported_and_a_first_sta
     assert not [words for words in view.health(10.0)[1] if "restarted" in words]
     view.restarted = True
     assert "restarted (brown-out or button)" in view.health(10.0)[1]
+
+
+@pytest.mark.parametrize("value", [6.0, 255.0, -1.0, float("nan")])
+def test_a_recorded_cause_of_a_restart_that_nobody_knows_is_unknown(value):
+    view = TeamMonitor()
+    view.update_without_link(1.0, [Status(1.0, 5, "reset_cause", value)])
+    assert view.rows(1.0)[0]["reset_cause"] == "unknown"

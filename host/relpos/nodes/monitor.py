@@ -36,6 +36,11 @@ _FLAGS = {
 }
 
 
+def reset_cause(value: float) -> wire.ResetCause:
+    """Return the cause that a status names; UNKNOWN for a value without a meaning."""
+    return next((c for c in wire.ResetCause if c == value), wire.ResetCause.UNKNOWN)
+
+
 class WindowedCount:
     """Growth within the window of a count that wraps at ``modulus`` and restarts with a boot."""
 
@@ -105,7 +110,7 @@ class NodeMonitor:
     def reset_cause(self) -> str | None:
         """Return the cause of the last reset; None before the first status."""
         cause = self.status.get("reset_cause")
-        return None if cause is None else wire.ResetCause(int(cause)).name.lower()
+        return None if cause is None else reset_cause(cause).name.lower()
 
     def frame_loss(self, now_s: float) -> float | None:
         """Return the fraction of frames lost within the window; None without frames."""
@@ -133,7 +138,7 @@ class NodeMonitor:
         """Return the inputs of :func:`relpos.nodes.health.assess`."""
         status = self.status
         success, attempted = self.ranging(now_s)
-        cause = wire.ResetCause(int(status.get("reset_cause", 0)))
+        cause = reset_cause(status.get("reset_cause", 0))
         known = self.restarted or cause is not wire.ResetCause.UNKNOWN
 
         def integer(name: str) -> int | None:

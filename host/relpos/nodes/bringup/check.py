@@ -37,6 +37,7 @@ from relpos.nodes.bringup.finding import (
     Finding,
 )
 from relpos.nodes.health import BATTERY_YELLOW_V, MIN_STACK_BYTES
+from relpos.nodes.monitor import reset_cause
 from relpos.protocol import messages as wire
 
 STATUS_MARGIN_S = 3.0
@@ -135,7 +136,7 @@ class NodeCheck:
         version = ".".join(
             f"{status[f'firmware_{part}']:.0f}" for part in ("major", "minor", "patch")
         )
-        cause = wire.ResetCause(int(status["reset_cause"])).name.lower().replace("_", " ")
+        cause = reset_cause(status["reset_cause"]).name.lower().replace("_", " ")
         self.figures |= {"firmware": version, "reset_cause": cause} | {
             name: status[name] for name in ("battery_v", "worst_tick_s", "free_stack_bytes")
         }
