@@ -52,7 +52,10 @@ def _subtract(dialogue: NodeDialogue, pair: tuple[int, int], offsets_mm: tuple[i
 
 @contextmanager
 def ranging_fast(dialogue: NodeDialogue, pair: tuple[int, int]) -> Iterator[None]:
-    """Let both nodes range twice a second meanwhile; restore their own periods at the end."""
+    """Let both nodes range twice a second meanwhile; restore their own periods at the end.
+
+    DeviceError where one does not take its own period back; the other does.
+    """
     periods_ms = {node: _read(dialogue, node, CommandCode.SET_RANGING_PERIOD_MS) for node in pair}
     try:
         for node in pair:
@@ -60,9 +63,19 @@ def ranging_fast(dialogue: NodeDialogue, pair: tuple[int, int]) -> Iterator[None
             dialogue.demand(CommandCode.SET_RANGING_PERIOD_MS, FAST_PERIOD_MS)
         yield
     finally:
+        by_hand: list[str] = []
         for node, period_ms in periods_ms.items():
             dialogue.node = node
-            dialogue.demand(CommandCode.SET_RANGING_PERIOD_MS, period_ms)
+            try:
+                dialogue.demand(CommandCode.SET_RANGING_PERIOD_MS, period_ms)
+            except DeviceError as error:
+                period = f"{period_ms / 1000:g}" if period_ms else "off"
+                by_hand.append(
+                    f"{error}\nnode {node} may still range every {FAST_PERIOD_MS} ms: "
+                    f"relpos node set PORT --node {node} ranging-period {period}"
+                )
+        if by_hand:
+            raise DeviceError("\n".join(by_hand))
 
 
 def collect(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> Iterator[float]:
