@@ -25,7 +25,7 @@ from relpos.link.decoder import Acknowledged
 from relpos.link.dialogue import open_dialogue
 from relpos.link.port import Link
 from relpos.nodes import cable as cable_module
-from relpos.nodes.bringup import NodeCheck, bus_access, check, radio
+from relpos.nodes.bringup import NodeCheck, bus_access, check, inertial, radio
 from relpos.nodes.bringup import finding as finding_names
 from relpos.nodes.cable import CablePort
 from relpos.protocol import messages as wire
@@ -230,6 +230,31 @@ def test_a_chip_at_its_other_address_is_told(
         told = next(f for f in node.findings() if f.right is False)
     assert (told.part, told.found) == (part, f"no answer at 0x{address:02X}")
     assert re.search("AD0|jumper", told.remedy)
+
+
+def test_a_check_that_is_interrupted_in_the_self_tests_restarts_the_node(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with checked(monkeypatch) as node:
+        device: Any = node._dialogue._port
+        read, write = device.read, bus_access.BusAccess.write
+
+        def interrupted(size: int = 1) -> bytes:
+            device.read = read
+            raise KeyboardInterrupt
+
+        def begin(bus: bus_access.BusAccess, address: int, register: int, value: int) -> Any:
+            done = write(bus, address, register, value)
+            if (register, value) == (inertial.GYRO_CONFIG, inertial.ON):
+                device.read = interrupted
+            return done
+
+        monkeypatch.setattr(bus_access.BusAccess, "write", begin)
+        boot = node._dialogue.boot()
+        with pytest.raises(KeyboardInterrupt):
+            list(node.findings())
+        assert node._dialogue.boot() != boot
+        assert node._bus.byte(0x68, inertial.GYRO_CONFIG) != inertial.ON
 
 
 def test_firmware_that_knows_no_transactions_is_told() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,9 +48,11 @@ def check(
     with connect(port, node, key_file, cable=cable) as dialogue:
         walk = NodeCheck(dialogue, cable=cable, peer=peer, distance_m=distance)
         try:
-            for finding in walk.findings():
-                findings.append(finding)
-                _show(finding)
+            # Ctrl-C while a line is shown: the node restarts before its port closes.
+            with closing(walk.findings()) as made:
+                for finding in made:
+                    findings.append(finding)
+                    _show(finding)
         finally:
             if report is not None:
                 _write(report, dialogue.node, findings, walk.figures)

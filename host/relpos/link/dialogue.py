@@ -58,7 +58,9 @@ class NodeDialogue:
         self.node = node
         self.link = link or Link()
         self._port = port
-        self._batches = observe(port, self.link, clock)
+        start_s = time.monotonic()
+        self._clock = clock or (lambda: time.monotonic() - start_s)
+        self._batches = observe(port, self.link, self._clock)
         self._token = int(time.time() * 10) % 0xFF00
         self._answers: dict[int, Acknowledged] = {}
         self.observations: deque[Observation] = deque(maxlen=MAX_KEPT)
@@ -66,7 +68,12 @@ class NodeDialogue:
 
     def listen(self) -> None:
         """Process what has arrived, or wait a moment for it; DeviceError where the port is gone."""
-        self.observations.extend(next(self._batches))
+        try:
+            batch = next(self._batches)
+        except BaseException:  # also Ctrl-C, after which a node may have to be told to stop
+            self._batches = observe(self._port, self.link, self._clock)
+            raise
+        self.observations.extend(batch)
         send(self._port, self.link.challenges())
         acknowledged = self.link.decoder.acknowledged
         while acknowledged:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import suppress
 
 from relpos.calibration.sensors import SensorCalibration
+from relpos.errors import DeviceError
 from relpos.link.dialogue import NodeDialogue
 from relpos.measurements import Status
 from relpos.nodes.bringup import compass, inertial, radio, ranging
@@ -76,8 +78,11 @@ class NodeCheck:
         self._distance_m = distance_m
         self._wrong: set[str] = set()
 
-    def findings(self) -> Iterator[Finding]:
-        """Yield each finding as it is made. DeviceError where the node falls silent."""
+    def findings(self) -> Generator[Finding]:
+        """Yield each finding as it is made. DeviceError where the node falls silent.
+
+        Closed early, it restarts the node, too.
+        """
         if not self._cable:
             yield from self._noted(radio.radio_findings(self._dialogue, self.figures))
             if RADIO in self._wrong:
@@ -87,6 +92,15 @@ class NodeCheck:
                 return
         else:
             yield Finding(RADIO, None, "has no part in it: the switch gives its line to the cable")
+        try:
+            yield from self._beyond_the_radio()
+        except BaseException:  # also Ctrl-C: the chips are still in their self-tests
+            with suppress(DeviceError):
+                self._dialogue.restart()
+            raise
+        self._dialogue.restart()
+
+    def _beyond_the_radio(self) -> Iterator[Finding]:
         first, heard = self._status(), self._heard()
         yield from self._noted(self._board(first))
         found = probe(self._bus)
@@ -99,7 +113,6 @@ class NodeCheck:
         if found.usable and IMU not in self._wrong:
             yield from self._noted(self._meanwhile(first, last))
             yield from self._noted(self._self_tests(found))
-        self._dialogue.restart()
 
     def _noted(self, findings: Iterator[Finding]) -> Iterator[Finding]:
         for finding in findings:
