@@ -209,3 +209,10 @@ def test_a_walk_that_does_not_match_the_stated_distance_is_refused():
         steps.fit_walk(2130, 40, 30.0, 60.0)
     with pytest.raises(DataError, match="steps"):
         steps.fit_walk(2130, 3, 2.0, 20.0)
+
+
+def test_an_accelerometer_that_is_stuck_at_zero_shows_no_attitude():
+    rate = np.zeros((60, 3))
+    rate[28:32, 0] = 2.0
+    assert inertial.still_stretches(np.zeros((60, 3)), rate, np.full(60, 0.2))
+    assert inertial.poses(np.zeros((60, 3)), rate, np.full(60, 0.2)) == []

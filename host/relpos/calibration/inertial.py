@@ -37,6 +37,8 @@ less than a kelvin. Not verified on hardware."""
 MAX_GYRO_BIAS_RAD_S = math.radians(40.0)
 POSE_APART_RAD = math.radians(25.0)
 """Attitudes closer than this count as one."""
+FORCE_OFF = 0.2
+"""Share of gravity by which an attitude's force may be off: more is no sensor at rest."""
 MIN_POSES = 3
 POSES_FOR_SCALE = 6
 MAX_BIAS_SIGMA_M_S2 = 0.05
@@ -132,7 +134,7 @@ def poses(force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray
     """Return the different attitudes at rest in order of time; repeated ones are merged.
 
     Arguments as of :func:`still_stretches`. Both force and rate must be free of motion: a steady
-    turn shows a rate that no other stretch shows, and is dropped.
+    turn shows a rate that no other stretch shows, and is dropped; so is a force unlike gravity.
     """
     stretches = still_stretches(force_m_s2, rate_rad_s, duration_s)
     if not stretches:
@@ -145,6 +147,8 @@ def poses(force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray
             continue
         weights = duration_s[stretch]
         pose = Pose(weights @ force_m_s2[stretch] / weights.sum(), float(weights.sum()))
+        if abs(float(np.linalg.norm(pose.force_m_s2)) / STANDARD_GRAVITY_M_S2 - 1.0) > FORCE_OFF:
+            continue
         for k, other in enumerate(kept):
             if _angle_rad(pose.force_m_s2, other.force_m_s2) < POSE_APART_RAD:
                 total = pose.duration_s + other.duration_s
