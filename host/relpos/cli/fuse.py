@@ -411,15 +411,14 @@ def _fuse_port(
     from relpos.link.port import check_port
     from relpos.measurements import common_priors
     from relpos.runs import Description
-    from relpos.runs.run import RECEIVED, TABLE_NAMES
-    from relpos.runs.table import find_table
+    from relpos.runs.run import RECEIVED, holds_run
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
     team_key(key_file)  # for its errors, before minutes of preparing
     received = job.out / RECEIVED
-    if any(find_table(received, name) for name in TABLE_NAMES):
+    if holds_run(received):
         raise DataError(f"{received}: holds what an earlier session received: choose another --out")
     # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
     # place are received later; two stand for them here.

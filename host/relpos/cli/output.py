@@ -91,10 +91,9 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
 def keep_recording(out: Path, command: str, made: str) -> None:
     """Refuse to replace a run that ``command`` has not ``made``: nobody could make it again."""
     from relpos.runs.description import read_description
-    from relpos.runs.run import TABLE_NAMES
-    from relpos.runs.table import find_table
+    from relpos.runs.run import holds_run
 
-    if not any(find_table(out, name) for name in TABLE_NAMES):
+    if not holds_run(out):
         return
     described = out / "run.toml"
     source = read_description(described).source if described.exists() else None

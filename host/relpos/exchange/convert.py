@@ -25,7 +25,7 @@ from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
-from relpos.runs.run import RECEIVED, TABLE_NAMES, Run, load_run, save_run
+from relpos.runs.run import RECEIVED, TABLE_NAMES, Run, holds_run, load_run, save_run
 from relpos.runs.table import find_table, remove_table
 
 _Written = tuple[list[Path], list[str]]
@@ -71,8 +71,8 @@ def _format_of(source: Path) -> Format:
     if not source.exists():
         raise DataError(f"{source}: no such file or directory")
     if source.is_dir():
-        tables = ("estimate.csv", *TABLE_NAMES)
-        if (source / "run.toml").exists() or any(find_table(source, name) for name in tables):
+        estimated = find_table(source, "estimate.csv")
+        if (source / "run.toml").exists() or estimated or holds_run(source):
             return Format.RUN
         if any(source.glob("*.tum")):
             return Format.TUM

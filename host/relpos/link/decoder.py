@@ -409,27 +409,26 @@ class Decoder:
         )
         along_m2 = max(total("variance_along_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
         scale_m = total("scale_error_m")
-        moved = [
-            Motion(
-                time_s,
-                node,
-                cosine * dx_m + sine * dy_m,
-                cosine * dy_m - sine * dx_m,
-                total("heading_rad"),
-                math.sqrt(along_m2 + max(scale_m * (scale_m + 2.0 * older["scale_error_m"]), 0.0)),
-                math.sqrt(
-                    max(total("variance_across_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
-                ),
-                math.sqrt(
-                    max(total("variance_heading_rad2"), 0.0) + UNSEEN_TURN_RAD_S_SQRT**2 * unseen_s
-                ),
-                values["gain_version"],
-                values["state"] == wire.MotionState.MOVING,
-                math.sqrt(along_m2 + scale_m**2),
-                round(total("steps")),
-            )
-        ]
-        observations: list[Observation] = [] if silent else [*moved]
+        motion = Motion(
+            time_s,
+            node,
+            cosine * dx_m + sine * dy_m,
+            cosine * dy_m - sine * dx_m,
+            total("heading_rad"),
+            math.sqrt(along_m2 + max(scale_m * (scale_m + 2.0 * older["scale_error_m"]), 0.0)),
+            math.sqrt(max(total("variance_across_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2),
+            math.sqrt(
+                max(total("variance_heading_rad2"), 0.0) + UNSEEN_TURN_RAD_S_SQRT**2 * unseen_s
+            ),
+            values["gain_version"],
+            values["state"] == wire.MotionState.MOVING,
+            math.sqrt(along_m2 + scale_m**2),
+            round(total("steps")),
+        )
+        observations: list[Observation] = []
+        if not silent:
+            observations.append(motion)
+            track.totals, track.unseen_s = dict(values), 0.0
         if quality & wire.Quality.HEIGHT_VALID:
             track.height_m = track.restart_height_m + values["height_m"]
             observations.append(Height(time_s, node, track.height_m))
@@ -445,8 +444,6 @@ class Decoder:
                 )
             )
         track.motion_s = time_s
-        if not silent:
-            track.totals, track.unseen_s = dict(values), 0.0
         return observations
 
     def _link_status(self, node: int, track: NodeTrack, time_s: float) -> list[Observation]:

@@ -15,7 +15,7 @@ import serial
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.errors import DeviceError
 from relpos.link.decoder import MAX_KEPT, Acknowledged
-from relpos.link.port import Line, Link, observe, send
+from relpos.link.port import Line, Link, observe, send, stopwatch
 from relpos.measurements import Observation, RawSample
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
@@ -58,8 +58,7 @@ class NodeDialogue:
         self.node = node
         self.link = link or Link()
         self._port = port
-        start_s = time.monotonic()
-        self._clock = clock or (lambda: time.monotonic() - start_s)
+        self._clock = clock or stopwatch()
         self._batches = observe(port, self.link, self._clock)
         self._token = int(time.time() * 10) % 0xFF00
         self._answers: dict[int, Acknowledged] = {}

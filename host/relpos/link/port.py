@@ -337,6 +337,12 @@ def _reason(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
+def stopwatch() -> Callable[[], float]:
+    """Return a clock: monotonic seconds from now."""
+    start_s = time.monotonic()
+    return lambda: time.monotonic() - start_s
+
+
 def observe(
     device: Line,
     link: Link,
@@ -347,9 +353,7 @@ def observe(
     ``clock`` gives the host's time in seconds (default: monotonic, from 0 at the first call).
     DeviceError when the port vanishes, after everything received before has been yielded.
     """
-    if clock is None:
-        start_s = time.monotonic()
-        clock = lambda: time.monotonic() - start_s  # noqa: E731
+    clock = clock or stopwatch()
     while True:
         try:
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))

@@ -421,7 +421,12 @@ RECEIVED = "received"
 """Folder of a session with the run that it received."""
 
 TABLE_NAMES = (*(table.name for table in _TABLES), "imu.csv", "landmarks.csv")
-"""The tables of a run directory: a folder that has one of them holds a run."""
+"""The tables of a run directory."""
+
+
+def holds_run(directory: Path) -> bool:
+    """Return whether a folder has one of the tables of a run."""
+    return any(find_table(directory, name) for name in TABLE_NAMES)
 
 
 def _by_kind(rows: Iterable[Observation | Truth]) -> dict[type, list[Any]]:
