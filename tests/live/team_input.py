@@ -103,6 +103,7 @@ class Album(Sink):
         self.observations = []
         self.estimates = []
         self.views = []
+        self.log = []
         self.closed = False
 
     def received(self, arrival_s, data):
@@ -116,6 +117,9 @@ class Album(Sink):
 
     def updated(self, view):
         self.views.append(view)
+
+    def logged(self, entry):
+        self.log.append(entry)
 
     def close(self):
         self.closed = True

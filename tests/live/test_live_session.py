@@ -384,6 +384,27 @@ def test_a_mayday_that_is_called_again_leaves_the_answers_of_the_roll_call():
     assert list(phones.board["roll_call"]["answers"]) == [2]
 
 
+def test_a_mayday_of_somebody_whose_node_is_not_heard_sounds_and_is_shown_until_it_is_over():
+    with EmulatedTeam(TeamConfig("straight", 2, 26.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        phones = Phones(
+            source,
+            (6.0, Request(1, "mayday", 6.0, {"node": 9, "on": True, "by": "Kim"})),
+            (22.0, Request(2, "mayday", 22.0, {"node": 9, "on": False})),
+        )
+        session, album = make_session(source, deadreckoning, phones)
+        run_through(session)
+    called = [view for view in album.views if 7.0 < view.time_s < 21.0]
+    assert called
+    for view in called:
+        (caller,) = [person for person in view.people if person.node == 9]
+        assert (caller.alert, caller.seen_s, caller.x_m) == (Alert.MAYDAY, None, None)
+        json.loads(view.to_json())
+    assert [e.text for e in album.log if e.kind == "alarm"] == ["Node 9 calls MAYDAY"]
+    assert phones.board["roll_call"]["nodes"] == [1, 2, 9]
+    assert [person.node for person in album.views[-1].people] == [1, 2]
+
+
 def test_a_port_that_vanishes_is_told_where_nothing_is_shown(tmp_path):
     remarks = []
     with EmulatedTeam(TeamConfig("straight", 2, 12.0, 3, beacons=True)) as team:

@@ -182,6 +182,9 @@ class Alarms:
         passed_s = 0.0 if self._ticked_s is None else max(now_s - self._ticked_s, 0.0)
         self._ticked_s = now_s
         passed_s = min(passed_s, MAX_TICK_S)
+        for node in self.mayday:
+            # Whom nobody has heard yet cannot fall silent.
+            self._states.setdefault(node, Condition(silent_s=-math.inf))
         for node, state in self._states.items():
             if listening:
                 state.silent_s += passed_s

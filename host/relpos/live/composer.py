@@ -115,7 +115,7 @@ class Composer:
         self._seq += 1
         estimate = self.nowcast.estimate
         located = {} if estimate is None else {n.node: n for n in estimate.nodes}
-        people = sorted(self.monitor.nodes.keys() | located.keys())
+        people = sorted(self.monitor.nodes.keys() | located.keys() | self.alarms.mayday)
         return TeamView(
             seq=self._seq,
             time_s=now_s,

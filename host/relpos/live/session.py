@@ -505,7 +505,8 @@ class LiveSession:
         if kind == "mayday" and body.get("on") and not again:
             # Who else is in trouble is asked at once.
             start = {"action": "start", "emergency": True, "within_s": 300.0}
-            self._happen({"kind": "rollcall", "by": body["by"], "nodes": everybody, **start})
+            called = sorted({*everybody, body["node"]})
+            self._happen({"kind": "rollcall", "by": body["by"], "nodes": called, **start})
         return {"done": True}, 200
 
     def _words(self, kind: str, body: dict[str, Any]) -> str:

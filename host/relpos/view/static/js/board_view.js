@@ -74,7 +74,9 @@ export class BoardView {
       select.replaceChildren(...teams.map((name) => make("option", { value: name, text: name })));
     }
     byId("evacuate-team").disabled = select.disabled = !teams.length;
-    for (const person of this.team.wearers()) {
+    const wearers = this.team.wearers();
+    for (const [node, row] of this.rows) row.element.hidden = !wearers.some((person) => person.node === node);
+    for (const person of wearers) {
       const row = this.rows.get(person.node) ?? this.make(person.node);
       const place = people[person.node] ?? {};
       setText(row.name, person.name);
