@@ -31,6 +31,15 @@ def test_a_code_lets_in_one_device_within_five_minutes() -> None:
     assert gate.admit(late, 1000.0 + INVITATION_S + 2) is None
 
 
+def test_a_code_that_was_fetched_by_a_device_ends_when_that_is_shut_out() -> None:
+    gate = Gate(KEY)
+    code, another = gate.invite(Role.LOOK, by="0f0f"), gate.invite(Role.LOOK, by="1e1e")
+    gate.revoked = {"0f0f"}
+    assert gate.admit(code) is None
+    assert gate.admit(another) is not None
+    assert gate.admit(gate.invite(Role.LOOK)) is not None, "of the computer itself"
+
+
 @pytest.mark.parametrize("index", range(0, 54, 7))
 def test_an_altered_token_is_none(index: int) -> None:
     gate = Gate(KEY)
@@ -151,3 +160,16 @@ def test_a_code_that_was_used_lets_nobody_in_and_the_next_one_does(mill: list[Mi
     assert page.ask("GET", again, commander).status_code == 303
     assert page.ask("GET", again, httpx.Cookies()).status_code == 303
     assert page.ask("GET", "/api/invite?role=king", commander).status_code == 400
+
+
+def test_whoever_is_shut_out_cannot_come_back_by_a_code_that_was_fetched_before(
+    mill: list[Mill],
+) -> None:
+    page = mill[0]
+    commander, _ = page.enter(Role.COMMAND)
+    other, _ = page.enter(Role.COMMAND)
+    own = page.ask("GET", "/api/devices", other).json()["own"]
+    code = page.ask("GET", "/api/invite?role=command", other).json()["url"]
+    page.ask("POST", "/api/revoke", commander, json={"id": own})
+    path = code.partition(str(page.access.port))[2]
+    assert page.ask("GET", path, httpx.Cookies()).status_code == 401

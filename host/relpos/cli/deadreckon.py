@@ -14,6 +14,7 @@ import typer
 from relpos.cli import output
 from relpos.cli.demo import Board
 from relpos.errors import DataError
+from relpos.files import write_output
 
 if TYPE_CHECKING:
     from relpos.emulator.deadreckoning import NodeResult
@@ -85,7 +86,7 @@ def deadreckon(
             out,
         )
         document = dumps({"nodes": nodes}, indent=2, allow_nan=False)
-        (out / "summary.json").write_text(document + "\n", encoding="utf-8")
+        write_output(out / "summary.json", document + "\n")
     for node, part in sorted(played.items()):
         _print_remarks(node, part, walks)
     if json:

@@ -18,6 +18,7 @@ from relpos.cli import output
 from relpos.cli.keys import KeyFile
 from relpos.cli.node_dialogue import Node, Port, connect
 from relpos.errors import DataError, DeviceError
+from relpos.files import write_output
 
 if TYPE_CHECKING:
     from relpos.calibration.antenna import RangeFit
@@ -285,7 +286,7 @@ def _write(out: Path, node: int, result: Result) -> None:
         draw(result.magnetometer, result.fields_ut, path)
         typer.echo(f"picture: {path}")
     lines = [f"{name.strip()}: {value}\n" for name, value in _rows(result)]
-    (out / f"node-{node}-calibration.txt").write_text("".join(lines), encoding="utf-8")
+    write_output(out / f"node-{node}-calibration.txt", "".join(lines))
 
 
 # -- steps -----------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import typer
 from relpos.cli.keys import KeyFile
 from relpos.cli.node_dialogue import Cable, Node, Port, connect
 from relpos.errors import DeviceError
+from relpos.files import write_output
 
 if TYPE_CHECKING:
     from relpos.nodes.bringup import Finding
@@ -74,6 +75,6 @@ def _write(path: Path, node: int, findings: list[Finding], figures: dict[str, ob
     lines = [{"part": f.part, "right": f.right, "found": f.found} for f in findings]
     document = {"relpos": __version__, "node": node, "findings": lines, "figures": figures}
     try:
-        path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+        write_output(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
     except OSError as error:
         raise DeviceError(f"{path}: cannot be written: {error.strerror}") from error

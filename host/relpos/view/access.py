@@ -67,9 +67,12 @@ class Access:
         """Whether anybody but this computer can reach it."""
         return not _is_loopback(self.hosts[0])
 
-    def url(self, path: str = "/", role: Role = Role.COMMAND) -> str:
-        """Address of a page with the session's token, or a mission's with a code for one device."""
-        token = self.token if self.key is None else Gate(self.key).invite(role)
+    def url(self, path: str = "/", role: Role = Role.COMMAND, by: str = "") -> str:
+        """Address of a page with the session's token, or a mission's with a code for one device.
+
+        ``by`` is the device that asks for the code.
+        """
+        token = self.token if self.key is None else Gate(self.key).invite(role, by=by)
         scheme = "http" if self.certificate is None else "https"
         host = f"[{self.hosts[0]}]" if ":" in self.hosts[0] else self.hosts[0]
         return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': token})}"

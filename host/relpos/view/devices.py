@@ -45,15 +45,15 @@ class Gate:
     used: set[str] = field(default_factory=set)
     revoked: set[str] = field(default_factory=set)
 
-    def invite(self, role: Role, now_s: float | None = None) -> str:
-        """Return a new code for a device of that role."""
+    def invite(self, role: Role, now_s: float | None = None, by: str = "") -> str:
+        """Return a new code for a device of that role; shutting out device ``by`` ends it."""
         expires = int((time.time() if now_s is None else now_s) + INVITATION_S)
-        return self._signed("i", f"{secrets.token_hex(8)}.{role}.{expires}")
+        return self._signed("i", f"{secrets.token_hex(8)}.{role}.{expires}.{by}")
 
     def admit(self, code: str | None, now_s: float | None = None) -> Device | None:
         """Return the device that an unused code lets in; the code is used from then on."""
         parts = self._read("i", code)
-        if parts is None or parts[0] in self.used:
+        if parts is None or parts[0] in self.used or not self.revoked.isdisjoint(parts[3:]):
             return None
         if float(parts[2]) < (time.time() if now_s is None else now_s):
             return None

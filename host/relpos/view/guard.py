@@ -150,6 +150,12 @@ def role_of(asking: HTTPConnection) -> Role:
     return Role.COMMAND if device is None else device.role
 
 
+def own_id(asking: HTTPConnection) -> str:
+    """Return the number of the mission's device that asks, empty for none."""
+    device: Device | None = asking.scope.get("device")
+    return "" if device is None else device.id
+
+
 def needed_role(asking: HTTPConnection) -> Role:
     """Return the role that a request needs: looking needs none but the first."""
     if asking.scope["path"] in COMMANDS:

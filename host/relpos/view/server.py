@@ -54,8 +54,8 @@ from relpos.view.bodies import (
     sigma_of,
     text_of,
 )
-from relpos.view.devices import Device, Role
-from relpos.view.guard import FORBIDDEN, TokenMiddleware, role_of
+from relpos.view.devices import Role
+from relpos.view.guard import FORBIDDEN, TokenMiddleware, own_id, role_of
 from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
 
 STATIC = Path(__file__).parent / "static"
@@ -243,7 +243,7 @@ class Pages:
 
         return serve
 
-    async def qr(self, _: Request) -> Response:
+    async def qr(self, request: Request) -> Response:
         """The phone page's address, token included, as a QR code; a mission's is new each time."""
         if not self._access.reachable:
             return PlainTextResponse(
@@ -252,7 +252,7 @@ class Pages:
                 404,
             )
         if self._code is None or self._access.key is not None:
-            self._code = qr_svg(self._access.url("/phone", role=Role.ACKNOWLEDGE))
+            self._code = qr_svg(self._access.url("/phone", Role.ACKNOWLEDGE, own_id(request)))
         return Response(self._code, media_type="image/svg+xml")
 
     async def follow(self, socket: WebSocket) -> None:
@@ -287,10 +287,7 @@ class Pages:
                 await socket.close(1001)
 
     def _is_revoked(self, asking: HTTPConnection) -> bool:
-        device: Device | None = asking.scope.get("device")
-        return device is not None and bool(
-            self.session.devices.get(device.id, {}).get("revoked", False)
-        )
+        return bool(self.session.devices.get(own_id(asking), {}).get("revoked", False))
 
     async def invite(self, request: Request) -> Response:
         """A code for one more device: its address, and how many devices there are."""
@@ -299,14 +296,15 @@ class Pages:
         role = request.query_params.get("role", str(Role.ACKNOWLEDGE))
         if role not in list(Role):
             raise BadRequestError(f"role: none of {', '.join(Role)}")
-        url = self._access.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
+        path = "/phone" if role == Role.ACKNOWLEDGE else "/"
+        url = self._access.url(path, Role(role), own_id(request))
         reachable = self._access.reachable
         return JSONResponse({"url": url, "svg": qr_svg(url), "reachable": reachable})
 
     async def devices(self, request: Request) -> Response:
         """All devices that were let in."""
-        own: Device | None = request.scope.get("device")
-        return JSONResponse({"own": own and own.id, "devices": list(self.session.devices.values())})
+        devices = list(self.session.devices.values())
+        return JSONResponse({"own": own_id(request) or None, "devices": devices})
 
     async def revoke(self, request: Request) -> Response:
         """Shut a device out, for good."""

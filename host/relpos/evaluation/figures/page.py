@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 
 from relpos.evaluation.figures.sheet import Beside, Cell, Sheet
+from relpos.files import write_output
 
 MOST_ROWS = 120
 """Longer lists of numbers are in the CSV alone."""
@@ -46,7 +47,7 @@ def write(sheets: Sequence[Sheet], pictures: Sequence[Path], path: Path, words: 
             numbers = _table(sheet.columns, [[_text(c) for c in row] for row in sheet.rows])
             parts.append(f"<details><summary>the numbers</summary>{numbers}</details>")
         parts.append(f"<p>Numbers: <code>{sheet.name}.csv</code></p>")
-    path.write_text("\n".join(parts) + "</html>\n", encoding="utf-8")
+    write_output(path, "\n".join(parts) + "</html>\n")
 
 
 def _beside(one: Beside) -> tuple[str, str, str]:
