@@ -62,6 +62,10 @@ def test_an_evacuation_knows_for_each_whether_it_was_shown_and_understood():
     assert (list(order.delivered), order.acknowledged[1]["by"]) == ([1], "Ben")
     assert 2 not in order.acknowledged
     assert (order.lit, board.called_out) == ({2: 1001.0}, [2])
+    # Node 1 has understood, went in again, and is ordered out again; 2 is still called.
+    board.apply(event("evacuate", 1060.0, action="order", nodes=[1, 2]))
+    assert (order.delivered, order.acknowledged, order.lit) == ({}, {}, {2: 1001.0})
+    assert board.called_out == [1, 2]
     board.apply(event("evacuate", action="end"))
     assert board.evacuation is None
 

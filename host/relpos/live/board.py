@@ -328,8 +328,11 @@ class Board:
             nodes = _nodes(event["nodes"])
             if order is None:
                 order = self.evacuation = Evacuation(event["unix_s"], event["by"], [])
-            # Who was called out before, and has answered, stays called out.
             order.nodes = sorted({*order.nodes, *nodes})
+            # Whoever has answered an order before is shown the new one, and asked again.
+            for node in order.acknowledged.keys() & set(nodes):
+                for said in (order.lit, order.delivered, order.acknowledged):
+                    said.pop(node, None)
             text = "{whom}EVACUATE {count}: order by radio, LED and phone"
             return Said("evacuate", text, whom="", count=len(nodes))
         if order is None:

@@ -102,9 +102,9 @@ export class BoardView {
       setAttribute(row.element, "data-mayday", String(row.hasMayday));
       const out = evacuation?.nodes.includes(person.node);
       row.tick.hidden = !out;
-      row.evacuate.hidden = out;
       setAttribute(row.evacuate, "aria-label", t("evacuate.name", { name: person.name }));
       const seen = evacuation?.acknowledged?.[person.node];
+      row.evacuate.hidden = out && !seen;
       setText(row.order, !out ? "" : seen ? t("evacuate.understood.by", { name: seen.by || t("somebody"), time: timeOfDay(1000 * seen.unix_s) })
         : ["delivered", "lit"].filter((way) => evacuation[way]?.[person.node]).map((way) => t(`evacuate.${way}`, { time: timeOfDay(1000 * evacuation[way][person.node]) })).join("; ")
           || t("evacuate.radio"));
