@@ -199,13 +199,12 @@ def record(
     *,
     seconds: float = SECONDS,
     nodes: int = NODES,
-    seed: int = SEED,
     board: str = "native",
 ) -> Record:
     """Let a team walk with those faults; the same arguments give the same record."""
     key = TEAM_KEY if any("key=stolen" in str(fault) for fault in faults) else wire.DEFAULT_KEY
     config = TeamConfig(
-        GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True, key=key
+        GOOD_CONDITIONS, nodes, seconds, SEED, board, faults=faults, beacons=True, key=key
     )
     with EmulatedTeam(config) as team:
         tap = _Tap(team.key)
@@ -232,9 +231,9 @@ def record(
 
 
 @cache
-def undisturbed(board: str = "native") -> Record:
+def undisturbed() -> Record:
     """The same team without any fault."""
-    return record((), board=board)
+    return record(())
 
 
 def example(fault: Fault, **values: str) -> str:
@@ -363,14 +362,14 @@ def _within(times: list[float], begin: float, end: float) -> list[float]:
     return times[bisect.bisect_left(times, begin) : bisect.bisect_left(times, end)]
 
 
-def compare(spec: str, board: str = "native") -> Outcome:
+def compare(spec: str) -> Outcome:
     """Run one SPEC beside the undisturbed team."""
     parsed = parse_fault(spec)
     begin_s = 0.0 if parsed.fault.whole_run else parsed.from_s
     end_s = SECONDS if math.isinf(parsed.to_s) else parsed.to_s
     if parsed.fault.momentary:
         end_s = begin_s
-    return Outcome(spec, record((spec,), board=board), undisturbed(board), begin_s, end_s)
+    return Outcome(spec, record((spec,)), undisturbed(), begin_s, end_s)
 
 
 def specs() -> list[tuple[Fault, str]]:

@@ -38,12 +38,12 @@ def baud_rates() -> str:
     rows = []
     for baud in (9600, 19200, 38400, 57600, 115200):
         error = 100.0 * traffic.baud_error(baud)
-        verdict = "too far off" if abs(error) > 0.5 else "fits"
-        if (
-            verdict == "fits"
-            and traffic.load(20, traffic.ranges_a_round(20), baud).line_share > 0.8
-        ):
+        if abs(error) > 0.5:
+            verdict = "too far off"
+        elif traffic.load(20, traffic.ranges_a_round(20), baud).line_share > 0.8:
             verdict = "too slow for 20 nodes"
+        else:
+            verdict = "fits"
         motion = f"{traffic.line_ms(baud):.0f} ms"
         rows.append((str(baud), f"{error:+.2f} %", motion, verdict))
     return table(("baud", "error at 16 MHz", "a motion report takes", ""), rows)
@@ -97,15 +97,14 @@ def batteries() -> str:
 
 def health_limits() -> str:
     """The rule of the three colours."""
-    percent = 100.0
     rows = (
         ("silent for", f"over {health.SILENT_S:g} s", ""),
         ("inertial sensor", "missing", ""),
         ("magnetometer, Pozyx, pressure sensor", "", "one missing"),
         (
             "frames lost",
-            f"over {percent * health.LOSS_RED:g} %",
-            f"over {percent * health.LOSS_YELLOW:g} %",
+            f"over {100.0 * health.LOSS_RED:g} %",
+            f"over {100.0 * health.LOSS_YELLOW:g} %",
         ),
         (
             "supply",
@@ -115,7 +114,7 @@ def health_limits() -> str:
         (
             "rangings that succeed",
             "",
-            f"under {percent * health.RANGING_YELLOW:g} % of {health.MIN_EXCHANGES} or more",
+            f"under {100.0 * health.RANGING_YELLOW:g} % of {health.MIN_EXCHANGES} or more",
         ),
         ("neighbours", "", "none in a team of two or more"),
         ("radio's signal", "", f"under {health.RSSI_YELLOW_DBM:g} dBm"),

@@ -23,13 +23,9 @@ AIR_WAIT_S = 0.0025
 """Mean back-off of the first attempt (7 slots of 0.32 ms), sensing, two turn-rounds."""
 
 
-@dataclass(frozen=True)
-class Periods:
-    """Seconds between a node's reports; the defaults are a new node's."""
-
-    motion_s: float = 1.0
-    ranging_s: float = 2.0
-    status_s: float = 10.0
+MOTION_S, RANGING_S, STATUS_S = 1.0, 2.0, 10.0
+"""Seconds between a new node's reports."""
+CLOCK_HZ = 16_000_000
 
 
 def packet_bytes(body_bytes: int) -> int:
@@ -48,11 +44,11 @@ def air_s(body_bytes: int) -> float:
     return (packet_bytes(body_bytes) + AIR_OVERHEAD_BYTES) * 8 * AIR_BIT_S + AIR_WAIT_S
 
 
-def reports(ranges_a_round: int, periods: Periods = Periods()) -> list[tuple[int, float]]:
+def reports(ranges_a_round: int) -> list[tuple[int, float]]:
     """(body bytes, times a second) of everything that a node sends by itself."""
     frames: list[tuple[int, float]] = [
-        (wire.MOTION.fixed_size, 1.0 / periods.motion_s),
-        (wire.STATUS.fixed_size, 1.0 / periods.status_s),
+        (wire.MOTION.fixed_size, 1.0 / MOTION_S),
+        (wire.STATUS.fixed_size, 1.0 / STATUS_S),
     ]
     assert wire.RANGES.entries is not None
     most = wire.RANGES.entries.most
@@ -60,7 +56,7 @@ def reports(ranges_a_round: int, periods: Periods = Periods()) -> list[tuple[int
     while left > 0:
         count = min(left, most)
         size = wire.RANGES.fixed_size + count * wire.RANGES.entry_size
-        frames.append((size, 1.0 / periods.ranging_s))
+        frames.append((size, 1.0 / RANGING_S))
         left -= count
     return frames
 
@@ -84,10 +80,10 @@ def load(nodes: int, ranges_a_round: int, baud: int = BAUD) -> Load:
     return Load(nodes, ranges_a_round, bytes_s, bytes_s * BITS_A_BYTE / baud, air)
 
 
-def baud_error(baud: int, clock_hz: int = 16_000_000) -> float:
+def baud_error(baud: int) -> float:
     """Relative error of the AVR's UART at double speed (U2X) with its best divisor."""
-    divisor = max(round(clock_hz / (8 * baud)), 1)
-    return clock_hz / (8 * divisor) / baud - 1.0
+    divisor = max(round(CLOCK_HZ / (8 * baud)), 1)
+    return CLOCK_HZ / (8 * divisor) / baud - 1.0
 
 
 def line_ms(baud: int) -> float:
@@ -95,10 +91,10 @@ def line_ms(baud: int) -> float:
     return math.ceil(serial_bytes(wire.MOTION.fixed_size)) * BITS_A_BYTE / baud * 1000.0
 
 
-def ranges_a_round(nodes: int, period_s: float = 2.0) -> int:
+def ranges_a_round(nodes: int) -> int:
     """Ranges that a node begins in a round: all others, or the next half as its slot has room."""
     wanted = nodes - 1 if nodes <= ALL_IN_A_ROUND else nodes // 2
-    return min(wanted, int(period_s / nodes / EXCHANGE_S))
+    return min(wanted, int(RANGING_S / nodes / EXCHANGE_S))
 
 
 def beacon_bytes(nodes: int) -> float:
