@@ -22,7 +22,7 @@ from relpos import fusion
 from relpos.cli import main
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.port import Link
-from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
+from relpos.link.xbee import virtual_time
 from relpos.live.composer import Composer
 from relpos.live.files import FileSink
 from relpos.live.fusion_thread import FusionThread
@@ -179,10 +179,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str, str]]]:
     """Title of a walk -> the calls of a live session, and of its replay, from its cause on."""
     with EmulatedTeam(TeamConfig("paper", len(NODES), 14.0, 2, beacons=True)) as team:
-        chunks = [
-            (us * 1e-6, encode(UnknownFrame(VIRTUAL_TIME, us.to_bytes(8, "big"))) + data)
-            for us, data in team.stream()
-        ]
+        chunks = [(us * 1e-6, virtual_time(us) + data) for us, data in team.stream()]
     link = Link()
     decoded, newest_s = [], []
     for arrival_s, data in chunks:

@@ -13,7 +13,7 @@ import serial
 from relpos.emulator.pty import PseudoTerminal
 from relpos.errors import DeviceError
 from relpos.link.port import Link, observe
-from relpos.link.xbee import VIRTUAL_TIME, Parser, Receive16, UnknownFrame, encode
+from relpos.link.xbee import VIRTUAL_TIME, Parser, Receive16, UnknownFrame, encode, virtual_time
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
@@ -224,7 +224,7 @@ def test_the_link_lives_in_the_marked_time_whatever_its_own_clock_says():
     motions = []
     for k in range(1, 100):
         frame = framing.encode(wire.MOTION, 5, 0, k, values | {"time_s": float(k)})
-        data = encode(UnknownFrame(VIRTUAL_TIME, (k * 1_000_000 + 2_000).to_bytes(8, "big")))
+        data = virtual_time(k * 1_000_000 + 2_000)
         motions += link.feed(data + encode(Receive16(5, -40, frame)), arrival_s=0.05 * k)
     assert [m.time_s for m in motions] == pytest.approx([k + 0.002 for k in range(1, 100)])
 

@@ -148,7 +148,8 @@ class Script:
         self._counters: Counter[int] = Counter()
         flags = self.u8()
         self._escaped = flags & 3 != 0
-        self.link = serial_port.Link(key=KEY, clock=lambda: 0.0, escaped=self._escaped)
+        self.link = serial_port.Link(key=KEY, clock=lambda: 0.0)
+        self.link.parser.escaped = self._escaped
         self.decoder = self.link.decoder = CheckedDecoder(totals)
         self._genuine = self.decoder.genuine
         self._chunk = flags >> 2

@@ -145,7 +145,7 @@ def test_a_host_reports_the_nodes_that_it_receives():
 def test_a_host_sends_none_to_an_emulated_team_that_marks_its_own_time():
     link = Link()
     beacons = HostBeacons(link)
-    link.feed(xbee.encode(xbee.UnknownFrame(xbee.VIRTUAL_TIME, (10**6).to_bytes(8, "big"))), 0.0)
+    link.feed(xbee.virtual_time(10**6), 0.0)
     link.feed(motion(6, 1), 0.5)
     assert beacons.due(1.0) == b""
 

@@ -59,10 +59,7 @@ def socket(tmp_path):
 def stream():
     """Eight seconds of two nodes, each piece marked with its virtual time."""
     with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
-        marks = []
-        for time_us, data in team.stream():
-            mark = xbee.UnknownFrame(xbee.VIRTUAL_TIME, time_us.to_bytes(8, "big"))
-            marks.append(xbee.encode(mark) + data)
+        marks = [xbee.virtual_time(time_us) + data for time_us, data in team.stream()]
         yield marks, team.priors()
 
 

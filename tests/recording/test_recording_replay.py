@@ -15,7 +15,7 @@ from sessions import serial_bytes
 from typer.testing import CliRunner
 
 from relpos.cli import main
-from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
+from relpos.link.xbee import virtual_time
 from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import open_recording
 from relpos.recording.replay import Replay
@@ -42,10 +42,7 @@ def recorded(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("replay")
     path, out = folder / "walk.mcap", folder / "live"
-    stream = [
-        encode(UnknownFrame(VIRTUAL_TIME, round(time_s * 1e6).to_bytes(8, "big"))) + data
-        for time_s, data in serial_bytes(4, 45.0, 4)
-    ]
+    stream = [virtual_time(round(s * 1e6)) + data for s, data in serial_bytes(4, 45.0, 4)]
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     command = ["fuse", os.ttyname(theirs), "--record", path, "--out", out, "--no-teach"]

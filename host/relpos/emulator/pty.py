@@ -26,7 +26,7 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link.port import BAUD, READ_TIMEOUT_S
-from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
+from relpos.link.xbee import virtual_time
 
 from .air import STEP_US
 
@@ -183,7 +183,7 @@ class PseudoTerminal:
             waited = self._wait_for_reader()
             for time_us, data in device.run(min(device.time_us + STEP_US, device.end_us)):
                 if self._mark_time:
-                    data = encode(UnknownFrame(VIRTUAL_TIME, time_us.to_bytes(8, "big"))) + data
+                    data = virtual_time(time_us) + data
                 waited |= self._write(time_us, data)
             if waited:
                 anchor_wall_s, anchor_us = time.monotonic(), device.time_us

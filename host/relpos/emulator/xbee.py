@@ -15,6 +15,7 @@ from relpos.link.xbee import (
     ApiFrame,
     AtCommand,
     AtResponse,
+    ModemStatus,
     Parser,
     Receive16,
     Receive64,
@@ -38,7 +39,6 @@ PAN_BROADCAST = 0x04
 ADDRESS_BROADCAST_OPTION = 0x02
 TRANSMIT_64 = 0x00
 QUEUED_AT_COMMAND = 0x09
-MODEM_STATUS = 0x8A
 HARDWARE_RESET = 0
 
 AT_OK = 0
@@ -145,7 +145,7 @@ class XbeeModule:
         """Supply off and on again: a frame half received is lost; the reset is reported."""
         self._parser = Parser(escaped=self._escaped)
         self._line_free_us = time_us
-        self._emit(time_us, UnknownFrame(MODEM_STATUS, bytes((HARDWARE_RESET,))))
+        self._emit(time_us, ModemStatus(HARDWARE_RESET))
 
     def _handle(self, frame: ApiFrame, time_us: int) -> None:
         if isinstance(frame, Transmit16):

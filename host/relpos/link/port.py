@@ -66,9 +66,8 @@ class Link:
         key: bytes = wire.DEFAULT_KEY,
         clock: Callable[[], float] | None = None,
         newest_counters: Mapping[int, int] | None = None,
-        escaped: bool = True,
     ) -> None:
-        self.parser = xbee.Parser(escaped=escaped)
+        self.parser = xbee.Parser()
         self.decoder = Decoder((key,), newest_counters)
         self.key = key
         self.counters_before = dict(newest_counters or {})
@@ -76,7 +75,6 @@ class Link:
         """Of nodes that have another key than the team's gives them, while that changes."""
         self._clock = clock or time.time
         self._counters: dict[int, HostCounter] = {}
-        self._escaped = escaped
         self._token = 0
         self.virtual_s: float | None = None
         """Virtual time of an emulated team that marks it; None for a real team."""
@@ -202,7 +200,7 @@ class Link:
             self.decoder.remarks.append(fault)
         data = framing.encode(message, node, 0, counter, values, self.key_of(node))
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
-        return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+        return xbee.encode(xbee.Transmit16(0, address, data))
 
     def challenges(self) -> bytes:
         """Return the bytes for nodes whose frame counters do not fit; see the decoder."""

@@ -187,6 +187,11 @@ def encode(frame: ApiFrame, *, escaped: bool = True) -> bytes:
     return bytes((DELIMITER,)) + rest
 
 
+def virtual_time(time_us: int) -> bytes:
+    """Return the mark of an emulated team: what follows arrives at ``time_us``."""
+    return encode(UnknownFrame(VIRTUAL_TIME, time_us.to_bytes(8, "big")))
+
+
 def interpret(frame_data: bytes) -> ApiFrame:
     """Return the frame in ``frame_data`` (type and body); UnknownFrame where unknown or short."""
     kind = _KINDS.get(frame_data[0])
