@@ -21,7 +21,6 @@ import contextlib
 import json
 import multiprocessing
 import os
-import re
 import signal
 import statistics
 import subprocess
@@ -39,6 +38,7 @@ from pathlib import Path
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from live_session import page_of
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.port import Link
 from relpos.measurements import Motion, Range
@@ -196,13 +196,8 @@ def main() -> int:
         )  # fmt: skip
         clients = []
         try:
-            assert session.stderr is not None
-            url = ""
-            for line in session.stderr:
-                if found := re.search(r"page: http(://\S+?)/\?(\S+)", line):
-                    url = f"ws{found[1]}/ws?{found[2]}"
-                    break
-            threading.Thread(target=lambda: list(session.stderr or ()), daemon=True).start()
+            host, key = page_of(session)
+            url = f"ws{host}/ws?{key}"
             for _ in range(wanted.browsers):
                 pipe, end = context.Pipe()
                 process = context.Process(target=follow, args=(url, end), daemon=True)

@@ -16,7 +16,6 @@ import json
 import math
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from typing import Any
 import httpx
 from websockets.sync.client import connect
 
+from live_session import page_of
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
 from relpos.measurements import Event, Motion, Range, Status
 from relpos.recording import container
@@ -193,21 +193,17 @@ def main() -> int:
         command = [sys.executable, "-m", "relpos.cli.main", "replay", str(path), "--no-open"]
         replay = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         try:
-            assert replay.stderr is not None
-            found = next(
-                f for line in replay.stderr if (f := re.search(r"http(://\S+?)/\?(\S+)", line))
-            )
-            threading.Thread(target=lambda: list(replay.stderr or ()), daemon=True).start()
-            follower = Follower(f"ws{found[1]}/ws?{found[2]}")
+            host, key = page_of(replay)
+            follower = Follower(f"ws{host}/ws?{key}")
             opened_s = follower.wait(lambda f: f.people > 0) - began_s
-            client = httpx.Client(base_url=f"http{found[1]}", timeout=60.0, follow_redirects=True)
-            client.get(f"/?{found[2]}")
+            client = httpx.Client(base_url=f"http{host}", timeout=60.0, follow_redirects=True)
+            client.get(f"/?{key}")
             early = seek(client, follower, seconds, wanted.seeks)
             read_s = follower.wait(lambda f: not f.reading) - began_s
             late = seek(client, follower, seconds, wanted.seeks)
             memory = None
             if chromium() is not None:
-                address = f"http{found[1]}/?{found[2]}"
+                address = f"http{host}/?{key}"
                 memory = page_memory(address, lambda: seek(client, follower, seconds, wanted.seeks))
             server_mb = resident_mb(replay.pid)
         finally:

@@ -31,6 +31,7 @@ from pathlib import Path
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from live_session import page_of
 from relpos.emulator.process import EmulatorProcess
 from relpos.emulator.team import TeamConfig
 
@@ -124,15 +125,8 @@ def main() -> int:
             stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         stack.callback(session.kill)
-        assert session.stderr is not None
-        url = ""
-        for line in session.stderr:
-            if found := re.search(r"page: http(://\S+?)/\?(\S+)", line):
-                url = f"ws{found[1]}/ws?{found[2]}"
-                break
-        errors: list[str] = []
-        threading.Thread(target=lambda: errors.extend(session.stderr or ()), daemon=True).start()
-        follower = Follower(url)
+        host, key = page_of(session)
+        follower = Follower(f"ws{host}/ws?{key}")
         threading.Thread(target=follower.follow, daemon=True).start()
         looks = watch(session, follower, seconds, wanted.look_s)
         session.send_signal(signal.SIGINT)
