@@ -12,23 +12,16 @@ import argparse
 
 import numpy as np
 
-from relpos import fusion, tracks
+from relpos import fusion
 from relpos.evaluation import bounds, consistency, metrics
-from relpos.fusion.estimator import Estimate, Estimator
+from relpos.fusion.estimator import Estimator
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 
 def score(run: SimulatedRun, estimator: Estimator) -> metrics.Metrics:
     """Run an estimator over a whole run."""
-    estimates: list[Estimate] = []
-    for measurement in run.measurements:
-        estimates += estimator.process(measurement)
-    estimates += estimator.finish()
-    return metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    estimates = [e for m in run.measurements for e in estimator.process(m)] + estimator.finish()
+    return metrics.of_estimates(estimates, run.truth)
 
 
 def main() -> None:

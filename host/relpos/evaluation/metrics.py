@@ -1,9 +1,9 @@
 """The metrics of the run format, exactly: how far an estimate of a team is from its truth.
 
-Everything here works on arrays and knows neither files nor estimators. With estimated positions
-p_i(t), true ones q_i(t) and pairs i < j, the epochs are all whole seconds where both exist; a
-track is interpolated linearly between rows at most ``MAX_GAP_S`` apart, its heading on the
-circle (the short way round).
+Everything works on arrays and knows no files; :func:`of_estimates` makes them. With estimated
+positions p_i(t), true ones q_i(t) and pairs i < j, the epochs are all whole seconds where both
+exist; a track is interpolated linearly between rows at most ``MAX_GAP_S`` apart, its heading on
+the circle (the short way round).
 
 All figures are invariant to the frame of the estimate: distances, shapes after the best
 rotation without reflection, and vectors in the body frame of the node that looks.
@@ -14,13 +14,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation.finite import mean, mean_of_rows, root_mean
 from relpos.evaluation.sides import share_on_wrong_side
-from relpos.tracks import Pair, Pairs, PairTrack, Tracks, align, interpolate, sample, whole_seconds
+from relpos.tracks import (
+    Pair,
+    Pairs,
+    PairTrack,
+    Tracks,
+    align,
+    estimated_pairs,
+    estimated_tracks,
+    interpolate,
+    sample,
+    true_tracks,
+    whole_seconds,
+)
+
+if TYPE_CHECKING:
+    from relpos.fusion.estimator import Estimate
+    from relpos.measurements import Truth
 
 Floats = npt.NDArray[np.float64]
 
@@ -86,6 +103,11 @@ def aligned_squared_distances(estimate_m: Floats, truth_m: Floats) -> Floats:
     moved = align(estimate_m, truth_m)(estimate_m)
     squared: Floats = ((moved - truth_m) ** 2).sum(axis=1)
     return squared
+
+
+def of_estimates(estimates: Sequence[Estimate], truth: Sequence[Truth]) -> Metrics:
+    """Score an estimator's estimates against a run's truth."""
+    return evaluate(estimated_tracks(estimates), true_tracks(truth), estimated_pairs(estimates))
 
 
 def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Metrics:

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relpos import fusion, settings, tracks
+from relpos import fusion, settings
 from relpos.errors import RelposError
 from relpos.evaluation import metrics
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank
-from relpos.fusion.estimator import Estimate
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.switching import SwitchingEstimator
 from relpos.measurements import Motion, Range
@@ -22,15 +21,8 @@ from relpos.simulation.paper import simulate_paper
 def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) -> metrics.Metrics:
     run = simulate_paper(scenario, seed, overrides)
     estimator = fusion.make("bank", run.priors, {}, seed)
-    estimates: list[Estimate] = []
-    for measurement in run.measurements:
-        estimates += estimator.process(measurement)
-    estimates += estimator.finish()
-    return metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    estimates = [e for m in run.measurements for e in estimator.process(m)] + estimator.finish()
+    return metrics.of_estimates(estimates, run.truth)
 
 
 @pytest.mark.parametrize(

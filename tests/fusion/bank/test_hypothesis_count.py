@@ -6,7 +6,6 @@ from copy import deepcopy
 
 import numpy as np
 
-from relpos import tracks
 from relpos.evaluation import metrics
 from relpos.fusion.bank import hypothesis_count
 from relpos.fusion.bank.core import BankCore
@@ -34,11 +33,7 @@ def _run(
         counts += [_core(bank).hypotheses.count] * len(made)
         estimates += made
     estimates += bank.finish()
-    figures = metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    figures = metrics.of_estimates(estimates, run.truth)
     return estimates, counts, bank, figures
 
 
@@ -182,9 +177,5 @@ def test_people_are_not_lost_to_low_heading_noise() -> None:
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     core = _core(bank)
     assert float(core.hypotheses.weights() @ core.hypotheses.models.low_heading_noise) < 0.1
-    figures = metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    figures = metrics.of_estimates(estimates, run.truth)
     assert figures.relative_distance_rmse_m < 1.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import relpos
-from relpos import fusion, tracks
+from relpos import fusion
 from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.models.north import OFFSET_RAD, North
@@ -38,11 +38,7 @@ def score(north_rad: float | None) -> tuple[metrics.Metrics, Estimate]:
         measurements.sort(key=lambda m: m.time_s)
     estimator = fusion.make("bank", run.priors, {}, 0)
     estimates = [e for m in measurements for e in estimator.process(m)] + estimator.finish()
-    figures = metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    figures = metrics.of_estimates(estimates, run.truth)
     return figures, estimates[-1]
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import relpos
 from reference import smoother as reference
-from relpos import fusion, tracks
+from relpos import fusion
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics
 from relpos.fusion.estimator import Estimate, Estimator, NodeStatus, Parameter
@@ -315,18 +315,10 @@ def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:
     return list(smoother.finish())
 
 
-def _score(run: SimulatedRun, estimates: list[Estimate]) -> metrics.Metrics:
-    return metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
-
-
 @cache
 def _paper_score(scenario: str, seed: int, seconds: int) -> metrics.Metrics:
     run = simulate_paper(scenario, seed, {"seconds": seconds})
-    return _score(run, _smoothed(run))
+    return metrics.of_estimates(_smoothed(run), run.truth)
 
 
 @pytest.mark.parametrize(
@@ -413,7 +405,7 @@ def test_a_run_without_motion_is_one_clear_error() -> None:
 
 def test_wild_ranges_do_not_bend_the_track() -> None:
     run = simulate_paper("paper-p1", 6, {"seconds": 80, "nlos_probability": 0.1})
-    score = _score(run, _smoothed(run, "deadreckoning"))
+    score = metrics.of_estimates(_smoothed(run, "deadreckoning"), run.truth)
     assert score.relative_distance_rmse_m < 0.15
     assert math.isfinite(score.nees_distance)
 
@@ -470,11 +462,7 @@ def test_ranges_without_sight_do_not_bend_a_track(seed: int) -> None:
     run = simulate_mission("mission-nlos", seed, {"seconds": 70, "nodes": 5})
     made = Smoother(fusion.make("bank", run.priors, {"hypotheses": 50}, 1), (), run.priors)
     estimates = [e for m in run.measurements for e in made.process(m)] + made.finish()
-    found = metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
+    found = metrics.of_estimates(estimates, run.truth)
     assert found.relative_distance_rmse_m < 0.2
 
 
