@@ -15,11 +15,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -30,12 +28,10 @@ from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.measurements import Measurement, Prior, Range, Truth
 from relpos.runs import load_run
 from relpos.simulation.paper import simulate_paper
+from shared_data import DATA
 
 Floats = npt.NDArray[np.float64]
 
-DATA = Path(
-    os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
-)
 WINDOW_S = 90.0
 
 

@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -23,8 +21,8 @@ import relpos
 from relpos.emulator.recorded_team import record_team
 from relpos.evaluation.metrics import Metrics
 from relpos.runs import Run
+from shared_data import DATA
 
-DATA = Path(os.environ.get("RELPOS_DATA", Path(__file__).parents[2] / "shared" / "data"))
 # Sets, and who: only people whose recordings lost no samples. Nobody says who carried a phone, so a
 # wearer is one recording, again and again: the six longest.
 TEAMS = {

@@ -17,7 +17,6 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from itertools import repeat
-from pathlib import Path
 
 import numpy as np
 
@@ -26,10 +25,8 @@ from relpos.evaluation import metrics, ranging
 from relpos.evaluation.finite import median
 from relpos.fusion import Estimate, NodeStatus
 from relpos.runs import InitialPose, Run, load_run
+from shared_data import DATA
 
-DATA = Path(
-    os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
-)
 RUNS = (
     "two_robots_vio/exp1_los",
     "two_robots_vio/exp3_los",
@@ -90,9 +87,7 @@ def score(
         if any(n.status in (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED) for n in e.nodes)
     ]
     kept = [e for e in estimates if e.time_s >= after_s]
-    m = metrics.evaluate(
-        tracks.estimated_tracks(kept), tracks.true_tracks(run.truth), tracks.estimated_pairs(kept)
-    )
+    m = metrics.of_estimates(kept, run.truth)
     figures = (
         m.relative_distance_rmse_m, m.relative_position_rmse_m, m.body_frame_rmse_m, m.nees_distance
     )  # fmt: skip

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import sys
 import tomllib
 from dataclasses import dataclass, replace
@@ -20,6 +19,9 @@ import scipy
 from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.simulation.team import SCENARIOS, make_team
 from relpos.simulation.world import FloatArray
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from shared_data import DATA
 
 HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 """In multiples of the step frequency: halves belong to the stride."""
@@ -266,17 +268,10 @@ def print_statistics(title: str, walks: list[GaitStatistics]) -> None:
         print(f"  {name:22s} " + row(mean(name)))
 
 
-def data_folder() -> Path | None:
-    """Find the folder of recordings, None where it is missing."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
-    folder = Path(os.environ.get("RELPOS_DATA", beside))
-    return folder if folder.is_dir() else None
-
-
 def main(arguments: list[str]) -> int:
     """Print simulated and recorded walks side by side."""
-    folder = Path(arguments[0]) if arguments else data_folder()
-    if folder is None or not folder.is_dir():
+    folder = Path(arguments[0]) if arguments else DATA
+    if not folder.is_dir():
         print("no recordings: give their folder, or set RELPOS_DATA", file=sys.stderr)
         return 1
     for name, groups in (("walk_chest", ((1.4, 1.68), (1.68, 1.9))), ("walk_lowerback_20m", ())):

@@ -22,7 +22,6 @@ from gait_statistics import (
     GaitStatistics,
     about,
     apparent_gain,
-    data_folder,
     events_of,
     gait_statistics,
     print_statistics,
@@ -35,6 +34,7 @@ from relpos.simulation.torso import rotation
 from relpos.simulation.world import FloatArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from shared_data import DATA
 from wearers.activities import Activity
 from wearers.indoor import INDOOR
 from wearers.motion import WearerTruth
@@ -465,11 +465,11 @@ def draw(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print simulated and recorded walks side by side."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
-    parser.add_argument("data", nargs="?", type=Path, default=data_folder())
+    parser.add_argument("data", nargs="?", type=Path, default=DATA)
     parser.add_argument("--pictures", type=Path, help="write the pictures into this folder")
     options = parser.parse_args(arguments)
-    folder: Path | None = options.data
-    if folder is None or not folder.is_dir():
+    folder: Path = options.data
+    if not folder.is_dir():
         print("no recordings: give their folder, or set RELPOS_DATA", file=sys.stderr)
         return 1
     excursions = recorded_excursions(folder), simulated_excursions(40, 5, 7)

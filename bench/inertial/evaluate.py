@@ -328,13 +328,13 @@ def main() -> None:
         for name, value in registers(options.verbose).items():
             print(f"{name:40} {value:8.2f}")
         return
-    found = walking.find(replay.data_folder())
+    found = walking.find(replay.DATA)
     fit = Fit(found)
-    biases_rad_s = walking.chip_biases_rad_s(replay.data_folder())
+    biases_rad_s = walking.chip_biases_rad_s(replay.DATA)
     rows = [judge(g, w, fit, biases_rad_s, options.verbose) for g, w in walking.groups_of(found)]
     print(table(rows))
     print(track_table(rows, found, fit))
-    if (replay.data_folder() / "walk_chest").is_dir():
+    if (replay.DATA / "walk_chest").is_dir():
         print("\n".join(f"{name} {value:.2f}" for name, value in chest().items()))
     if options.json is not None:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")

@@ -49,7 +49,7 @@ def corridor(path: Path) -> None:
     """The same corridor both ways, from where it is entered."""
     figure, (axes,) = _axes(7.5, 3.0, 1)
     for name, label in zip(recordings.CORRIDOR, ("there", "back"), strict=True):
-        recording = replay.load(replay.data_folder() / "walk_chest" / name)
+        recording = replay.load(replay.DATA / "walk_chest" / name)
         track = track_of(recording)
         # Both from the same end: the way back is turned round and set on its own last position.
         track = track if label == "there" else (track[-1] - track)[::-1]
@@ -65,7 +65,7 @@ def waypoints(path: Path) -> None:
     """A waypoint walk that works and one that does not."""
     figure, both = _axes(9.0, 4.2, 2)
     for axes, name in zip(both, (GOOD_WAYPOINTS, BAD_WAYPOINTS), strict=True):
-        folder = replay.data_folder() / "walk_handheld_waypoints" / name
+        folder = replay.DATA / "walk_handheld_waypoints" / name
         recording = replay.load(folder)
         times_s, places = recordings.waypoints_of(folder)
         axes.plot(places.real - places[0].real, places.imag - places[0].imag, "k.--", label="truth")
@@ -86,7 +86,7 @@ def lower_back(path: Path) -> None:
     """10 m, U-turn, 10 m: a sound recording, and one that lost samples on the way back."""
     figure, both = _axes(9.0, 3.0, 2)
     for axes, name in zip(both, (SOUND_SAMPLES, LOST_SAMPLES), strict=True):
-        recording = replay.load(replay.data_folder() / "walk_lowerback_20m" / name)
+        recording = replay.load(replay.DATA / "walk_lowerback_20m" / name)
         track = track_of(recording)
         axes.plot(track.real, track.imag, lw=1.2)
         axes.plot([0, 10], [0, 0], "k--", lw=0.8)

@@ -22,7 +22,7 @@ def folders(data_set: str) -> list[Path]:
     def numbers(folder: Path) -> list[tuple[int, str]]:
         return [(int(p), "") if p.isdigit() else (-1, p) for p in folder.name.split("-")]
 
-    return sorted((replay.data_folder() / data_set).iterdir(), key=numbers)
+    return sorted((replay.DATA / data_set).iterdir(), key=numbers)
 
 
 def waypoints_of(folder: Path) -> tuple[Array, Track]:

@@ -17,6 +17,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -28,6 +29,10 @@ import scipy
 from numpy.typing import NDArray
 
 from relpos.calibration.steps import LEG_OF_STATURE
+
+# At the end: `recordings` is this folder's.
+sys.path.append(str(Path(__file__).parents[1]))
+from shared_data import DATA as DATA
 
 Array = NDArray[np.float64]
 
@@ -55,11 +60,6 @@ COUNTERS = (
     "covariance_repairs",
     "turned_sensors",
 )
-
-
-def data_folder() -> Path:
-    """Folder of the recordings: ``RELPOS_DATA``, else ``../shared/data`` beside the project."""
-    return Path(os.environ.get("RELPOS_DATA", ROOT.parent / "shared" / "data"))
 
 
 TUNABLE = ("kTurn_rad", "kSmallRise_m", "kWalkRatio_m_s", "kLimpShare")

@@ -54,7 +54,7 @@ def errors(data: Path, person: str, rng: np.random.Generator) -> tuple[float, fl
 
 def main() -> None:
     """Print a line a person and the mean."""
-    data, rng = replay.data_folder() / "stairs_mocap_virtual", np.random.default_rng(0)
+    data, rng = replay.DATA / "stairs_mocap_virtual", np.random.default_rng(0)
     people = sorted({folder.name.partition("Treppe")[0] for folder in data.iterdir()})
     found = 100.0 * np.array([errors(data, person, rng) for person in people])
     for name, (alone, climbed) in zip([*people, "mean"], [*found, found.mean(axis=0)], strict=True):

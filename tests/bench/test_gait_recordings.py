@@ -7,17 +7,15 @@ excursion or a wrong frequency fails.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from gait_statistics import (
     GaitStatistics,
-    data_folder,
     recorded_walk,
     simulated_walks,
 )
+from shared_data import DATA
 from wearer_statistics import (
     Excursions,
     recorded_bouts,
@@ -30,9 +28,8 @@ from wearer_statistics import (
     simulated_walking,
 )
 
-FOLDER = data_folder()
 pytestmark = pytest.mark.skipif(
-    FOLDER is None, reason="no recordings beside the repository nor in RELPOS_DATA"
+    not DATA.is_dir(), reason="no recordings beside the repository nor in RELPOS_DATA"
 )
 
 
@@ -42,8 +39,7 @@ def mean(walks: list[GaitStatistics], name: str) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, list[GaitStatistics]]:
-    assert FOLDER is not None
-    walks = [w for f in sorted((FOLDER / "walk_chest").iterdir()) if (w := recorded_walk(f))]
+    walks = [w for f in sorted((DATA / "walk_chest").iterdir()) if (w := recorded_walk(f))]
     return {
         "slow": [w for w in walks if w.step_frequency_hz < 1.68],
         "brisk": [w for w in walks if w.step_frequency_hz >= 1.68],
@@ -125,14 +121,9 @@ def test_steps_repeat_neither_exactly_nor_less_than_real_ones(
         assert 0.4 < float(mean(walks, "stride_similarity")) < 0.95
 
 
-def recordings() -> Path:
-    assert FOLDER is not None
-    return FOLDER
-
-
 @pytest.fixture(scope="module")
 def excursions() -> tuple[Excursions, Excursions]:
-    return recorded_excursions(recordings()), simulated_excursions(24, 3, 31)
+    return recorded_excursions(DATA), simulated_excursions(24, 3, 31)
 
 
 def test_step_length_follows_the_excursion_as_loosely_as_in_real_people(
@@ -157,7 +148,7 @@ def test_step_length_follows_the_excursion_as_loosely_as_in_real_people(
 def test_wearers_backs_move_as_much_as_real_ones() -> None:
     real = [
         w.statistics
-        for w in recorded_walking(recordings() / "walk_lowerback_20m")
+        for w in recorded_walking(DATA / "walk_lowerback_20m")
         if 1.75 <= w.statistics.step_frequency_hz < 2.3
     ]
     ours = [w.statistics for w in simulated_walking("lower_back", (1.05, 1.3), 12, 32)]
@@ -170,7 +161,7 @@ def test_wearers_backs_move_as_much_as_real_ones() -> None:
 
 
 def test_slow_indoor_steps_lift_as_much_for_their_length() -> None:
-    real, ours = recorded_bouts(recordings()), simulated_bouts(12, 33)
+    real, ours = recorded_bouts(DATA), simulated_bouts(12, 33)
     for column in range(real.shape[1]):
         low, high = np.percentile(ours[:, column], [3, 97])
         # One recorded person: inside the range, not at its middle.
@@ -179,8 +170,8 @@ def test_slow_indoor_steps_lift_as_much_for_their_length() -> None:
 
 
 def test_a_buildings_field_leads_astray_as_far_as_a_real_one() -> None:
-    folders = sorted((recordings() / "walk_handheld_waypoints").iterdir())[::4]
-    real = np.nanmedian(recorded_fields(recordings(), folders), axis=0)
+    folders = sorted((DATA / "walk_handheld_waypoints").iterdir())[::4]
+    real = np.nanmedian(recorded_fields(DATA, folders), axis=0)
     ours = np.nanmedian(simulated_fields(12, 34), axis=0)
     ratio = ours / real
     # Heading off (median, 95 %), norm, dip, and changes over 1 to 10 s.

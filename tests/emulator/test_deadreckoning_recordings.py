@@ -22,7 +22,7 @@ import recordings  # noqa: E402
 
 def needs(data_set):
     return pytest.mark.skipif(
-        not (replay.data_folder() / data_set).is_dir(),
+        not (replay.DATA / data_set).is_dir(),
         reason=f"no recordings: {data_set} is not in ../shared/data (or RELPOS_DATA)",
     )
 
@@ -104,14 +104,14 @@ MOST_PERCENT = {  # mean absolute, from the stature alone, constants fitted with
 
 @pytest.fixture(scope="module")
 def found():
-    return walks.find(replay.data_folder())
+    return walks.find(replay.DATA)
 
 
 @pytest.fixture(scope="module")
 def rows(found):
     # The page's own grid is five times as large.
     fit = walks.Fit(found, {name: values[::2] for name, values in walks.CONSTANTS.items()})
-    biases_rad_s = walks.chip_biases_rad_s(replay.data_folder())
+    biases_rad_s = walks.chip_biases_rad_s(replay.DATA)
     return {g: evaluate.judge(g, w, fit, biases_rad_s) for g, w in walks.groups_of(found)}
 
 
@@ -195,7 +195,7 @@ def test_no_step_has_a_negative_length():
     # Where people stand and turn, a step may end behind where it began: reported as unsigned
     # millimetres, -0.2 m had become 65.3 m.
     for name in ("031", "058", "070", "072"):
-        walk = replay.load(replay.data_folder() / "walk_handheld_waypoints" / name)
+        walk = replay.load(replay.DATA / "walk_handheld_waypoints" / name)
         rows = replay.reckon(walk.imu, walk.field_ut).rows
         assert rows["last_step_length_m"].min() >= 0.0
         assert np.diff(rows["path_m"]).min() >= 0.0

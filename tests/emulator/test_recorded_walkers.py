@@ -1,8 +1,5 @@
 """Recordings of real people through the firmware as a team."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -11,8 +8,7 @@ from relpos.cli.main import app
 from relpos.emulator.recorded_team import one_mission
 from relpos.runs import load_run
 from relpos.runs.imu import ImuRecording
-
-DATA = Path(os.environ.get("RELPOS_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from shared_data import DATA
 
 
 def standing(up, seconds):

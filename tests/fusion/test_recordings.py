@@ -6,10 +6,8 @@ Biases, noise levels and step scales are unknown to the estimators.
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +16,8 @@ from relpos import fusion, tracks
 from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.runs import InitialPose, Run, load_run
+from shared_data import DATA
 
-DATA = Path(
-    os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data"
-)
 ROBOTS = ("two_robots_vio/exp3_los", "two_robots_vio/exp4_los", "two_robots_vio/exp1_unobservable")
 
 
@@ -35,17 +31,9 @@ def fused(name: str, seed: int = 0) -> tuple[Run, list[Estimate], dict[str, int]
     return run, estimates, dict(bank.counters())
 
 
-def scored(run: Run, estimates: list[Estimate]) -> metrics.Metrics:
-    return metrics.evaluate(
-        tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
-        tracks.estimated_pairs(estimates),
-    )
-
-
 def test_four_robots_with_uncalibrated_ranges_are_placed_to_a_decimetre() -> None:
     run, estimates, counters = fused("four_robots_uwb/run1")
-    score = scored(run, estimates)
+    score = metrics.of_estimates(estimates, run.truth)
     assert score.relative_distance_rmse_m <= 0.10
     assert score.relative_position_rmse_m is not None
     assert score.relative_position_rmse_m <= 0.085
@@ -87,7 +75,7 @@ def test_two_robots_are_placed_better_than_by_dead_reckoning(
     name: str, distance_m: float, body_m: float
 ) -> None:
     run, estimates, _ = fused(name)
-    score = scored(run, estimates)
+    score = metrics.of_estimates(estimates, run.truth)
     assert score.relative_distance_rmse_m < distance_m
     assert score.body_frame_rmse_m is not None
     assert score.body_frame_rmse_m < body_m
@@ -103,8 +91,8 @@ def test_an_odometry_that_slips_by_137_degrees_is_noticed_and_recovered_from() -
     ]
     assert 145.0 < doubted[0] < 190.0
     # It slips from 145 to 165 s (the log shows the last of it at 168 s).
-    recovered = scored(run, [e for e in estimates if 205.0 <= e.time_s < 215.0])
+    recovered = metrics.of_estimates([e for e in estimates if 205.0 <= e.time_s < 215.0], run.truth)
     assert recovered.body_frame_rmse_m is not None
     assert recovered.body_frame_rmse_m < 1.0
     # The estimates in between were consistent.
-    assert scored(run, estimates).nees_distance < 2.0  # type: ignore[operator]
+    assert metrics.of_estimates(estimates, run.truth).nees_distance < 2.0  # type: ignore[operator]

@@ -11,9 +11,9 @@ import pytest
 
 from relpos.recordings import catalog
 from relpos.recordings.tables import Archive, digest
+from shared_data import DATA
 
 COPIES = Path(os.environ.get("RELPOS_SOURCES", "no-sources"))
-DATA = Path(os.environ.get("RELPOS_DATA", Path(__file__).parents[3] / "shared" / "data"))
 LARGEST_DIFFERENCE = {
     "walk_phone_museum": 0.03,
     "walk_mocap_virtual": 0.002,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import math
-import os
 import re
 from dataclasses import MISSING, fields, replace
 from itertools import count
@@ -39,6 +38,7 @@ from relpos.runs import (
 )
 from relpos.runs.run import assemble
 from relpos.tracks import estimated_pairs
+from shared_data import DATA
 
 MOTION = "time_s,node,dx_m,dy_m,dtheta_rad\n1,1,0.5,0,0\n1,2,0.4,0.1,-0.2\n"
 RANGES = "time_s,node,peer,range_m\n0.5,1,2,3.25\n"
@@ -562,16 +562,11 @@ def test_the_status_of_a_pair_is_that_of_the_file(tmp_path: Path) -> None:
     assert read_estimates(tmp_path)[1].pair_statuses() == ["ambiguous", "ok", "lost"]
 
 
-def data_directory() -> Path:
-    beside = Path(__file__).resolve().parents[2].parent / "shared" / "data"
-    return Path(os.environ.get("RELPOS_DATA", beside))
-
-
 @pytest.mark.parametrize("most", [2, pytest.param(None, marks=pytest.mark.soak)])
-@pytest.mark.skipif(not data_directory().is_dir(), reason="no folder of real recordings")
+@pytest.mark.skipif(not DATA.is_dir(), reason="no folder of real recordings")
 def test_every_real_recording_loads(most: int | None) -> None:
     """Of each data set so many, or all."""
-    sets = [sorted(path.glob("*/run.toml")) for path in data_directory().iterdir()]
+    sets = [sorted(path.glob("*/run.toml")) for path in DATA.iterdir()]
     directories = [run.parent for runs in sets for run in runs[:most]]
     assert directories
     for directory in directories:

@@ -2,15 +2,12 @@
 
 import csv
 import gzip
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from relpos.simulation import range_errors
-
-DATA = Path(os.environ.get("RELPOS_DATA", Path(__file__).parents[3] / "shared" / "data"))
+from shared_data import DATA
 
 
 def table(name, condition):

@@ -15,7 +15,6 @@ import threading
 import time
 import tty
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -31,9 +30,9 @@ from relpos.measurements import Motion, Range
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, save_run
+from shared_data import DATA
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
-DATA = Path(os.environ.get("RELPOS_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PATIENCE_S = 120
 
 
@@ -204,8 +203,7 @@ class Port:
     def feed(self, stream):
         """Give the bytes at once, each with its virtual time, and wait until they are read."""
         for time_s, data in stream:
-            stamp = xbee.UnknownFrame(xbee.VIRTUAL_TIME, round(time_s * 1e6).to_bytes(8, "big"))
-            data = xbee.encode(stamp) + data
+            data = xbee.virtual_time(round(time_s * 1e6)) + data
             while data:
                 data = data[os.write(self._ours, data) :]
         # Empty once is not empty: the kernel hands on what was written piece by piece.

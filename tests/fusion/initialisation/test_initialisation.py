@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -33,12 +31,9 @@ from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.runs import NodeInfo, load_run
 from relpos.simulation.paper import simulate_paper
+from shared_data import DATA
 
 Floats = npt.NDArray[np.float64]
-
-DATA = Path(
-    os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[4] / "shared" / "data"
-)
 
 
 class Walk:
