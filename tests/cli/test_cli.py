@@ -17,21 +17,18 @@ import tty
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from relpos.cli import main, output
+from relpos.cli import output
 from relpos.evaluation.summary import FIGURES
 from relpos.link import xbee
 from relpos.measurements import Motion, Step
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, read_estimates
+from support.command import relpos
 
 MOTION_HEADER = "time_s,node,dx_m,dy_m,dtheta_rad\n"
-
-
-def relpos(*arguments: object) -> Result:
-    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
 
 
 def one_clear_line(result: Result) -> str:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from typer.testing import CliRunner
-
-from relpos.cli.main import app
 from relpos.measurements import Motion, Prior, Range, Truth
 from relpos.runs import Description, Run, save_run
+from support.command import relpos
 
 
 def test_both_tables_of_a_scored_run_show_the_same_second(tmp_path: Path) -> None:
@@ -33,8 +31,8 @@ def test_both_tables_of_a_scored_run_show_the_same_second(tmp_path: Path) -> Non
         ),
     )
     save_run(run, tmp_path / "run")
-    words = ["fuse", str(tmp_path / "run"), "--estimator", "deadreckoning", "--no-report"]
-    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
+    words = ("fuse", tmp_path / "run", "--estimator", "deadreckoning", "--no-report")
+    done = relpos(*words, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     first = re.search(r"deadreckoning, at (\S+) s", done.stdout)
     second = re.search(r"the end at (\d+) s", done.stdout)

@@ -6,14 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from relpos.cli import main
 from relpos.evaluation.report.page import _PAGE
-
-
-def relpos(*arguments: object) -> Result:
-    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
+from support.command import relpos
 
 
 def refusal(*arguments: object) -> str:

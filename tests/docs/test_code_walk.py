@@ -16,10 +16,8 @@ from itertools import groupby
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from relpos import fusion
-from relpos.cli import main
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.port import Link
 from relpos.link.xbee import virtual_time
@@ -36,6 +34,7 @@ from relpos.recording.about import About
 from relpos.runs import Description
 from relpos.view.access import listen
 from relpos.view.web import WebView
+from support.command import relpos
 
 pytty = pytest.importorskip("tty")
 
@@ -241,9 +240,7 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str
         driver.join()
         session.finish()
         found["One replayed byte"] = trace.during(
-            lambda: CliRunner().invoke(
-                main.app, ["fuse", str(out / "walk.mcap"), "--out", str(out), "--no-report"]
-            )
+            lambda: relpos("fuse", out / "walk.mcap", "--out", out, "--no-report")
         )
     os.close(master)
     return found

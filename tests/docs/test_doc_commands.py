@@ -27,12 +27,11 @@ from doc_commands import (
     unknown_options,
     why_only_parsed,
 )
-from typer.testing import CliRunner
 
-from relpos.cli import main
 from relpos.emulator.pty import PseudoTerminal
 from relpos.simulation.team import make_team
 from relpos.simulation.walker import RATE_HZ
+from support.command import relpos
 
 PATIENCE_S = 120
 STANDS_FOR = (
@@ -72,10 +71,6 @@ RUN = list(
 )[::-1]
 THEIRS = [c for c in SHOWN if program(c.words) != "relpos"]
 MENTIONED = sorted({c.words: c for page in PAGES for c in mentions(page)}.values(), key=str)
-
-
-def relpos(*arguments):
-    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
 
 
 @contextmanager

@@ -6,10 +6,8 @@ from datetime import UTC, datetime
 from functools import partial
 
 import pytest
-from typer.testing import CliRunner
 
 from relpos import extras
-from relpos.cli import main
 from relpos.doctor import devices, installation
 from relpos.doctor.computer import Computer, SerialPort
 from relpos.emulator.pty import PseudoTerminal
@@ -19,6 +17,7 @@ from relpos.errors import DeviceError
 from relpos.fusion import ROOMS, kernel_cache
 from relpos.link import xbee
 from relpos.link.authentication import write_new_key
+from support.command import relpos
 
 PORT = "/dev/ttyUSB0"
 CH340 = SerialPort(PORT, "USB Serial", 0x1A86, 0x7523)
@@ -328,8 +327,7 @@ def test_a_port_that_does_not_open_is_wrong():
 # -- the command -----------------------------------------------------------------------------------
 
 
-def doctor(*arguments):
-    return CliRunner().invoke(main.app, ["doctor", *arguments], catch_exceptions=False)
+doctor = partial(relpos, "doctor")
 
 
 def test_an_emulated_coordinator_is_well_for_the_command(tmp_path):

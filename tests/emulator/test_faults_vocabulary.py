@@ -4,13 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import fault_runs
 import reliability
-from relpos.cli import main
 from relpos.emulator.faults import FAULTS, REFUSED, TARGETS, FaultError, help_text, parse_fault
 from relpos.emulator.team import EmulatedTeam, TeamConfig
+from support.command import relpos
 
 NODES = (1, 2, 3)
 
@@ -97,7 +96,7 @@ def test_a_mistake_is_reported_in_one_line_that_says_what_is_allowed(spec, words
 
 @pytest.mark.parametrize("command", [("demo",), ("emulate", "--nodes", "3")])
 def test_the_command_line_refuses_with_one_line_and_status_2(command):
-    done = CliRunner().invoke(main.app, [*command, "--fault", "clock:garbage"])
+    done = relpos(*command, "--fault", "clock:garbage")
     assert done.exit_code == 2
     assert done.stderr.startswith("relpos: fault 'clock:garbage': refused")
     assert done.stderr.count("\n") == 1
@@ -105,7 +104,7 @@ def test_the_command_line_refuses_with_one_line_and_status_2(command):
 
 @pytest.mark.parametrize("command", ["demo", "emulate"])
 def test_the_help_lists_every_fault_with_its_keys(command):
-    done = CliRunner().invoke(main.app, [command, "--help"])
+    done = relpos(command, "--help")
     shown = " ".join(done.stdout.split())
     for fault in FAULTS:
         assert fault.behaviour in shown.split(f"{fault.target} - ")[1]

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.emulator.recorded_team import one_mission
 from relpos.runs import load_run
 from relpos.runs.imu import ImuRecording
 from shared_data import DATA
+from support.command import relpos
 
 
 def standing(up, seconds):
@@ -34,9 +33,10 @@ def test_recordings_join_without_a_jump_of_gravity():
 )
 def test_simulate_writes_a_team_of_real_walkers(tmp_path):
     walks = DATA / "walk_lowerback_20m"
-    arguments = ["simulate", "--recordings", str(walks / "11-*"), str(walks / "13-1")]
-    arguments += ["--seed", "0", "--out", str(tmp_path / "team"), "--set", "seconds=40"]
-    done = CliRunner().invoke(app, arguments)
+    done = relpos(
+        "simulate", "--recordings", walks / "11-*", walks / "13-1", "--seed", 0,
+        "--out", tmp_path / "team", "--set", "seconds=40",
+    )  # fmt: skip
     assert done.exit_code == 0, done.output
     run = load_run(tmp_path / "team")
     assert run.node_ids == (1, 2)
@@ -48,8 +48,8 @@ def test_simulate_writes_a_team_of_real_walkers(tmp_path):
 
 
 def test_what_simulate_is_to_make_has_to_be_clear(tmp_path):
-    out = ["--seed", "0", "--out", str(tmp_path / "team")]
+    out = ("--seed", 0, "--out", tmp_path / "team")
     for arguments in (["--scenario", "paper", "--recordings", "a"], [], ["--scenario", "lab", "a"]):
-        done = CliRunner().invoke(app, ["simulate", *arguments, *out])
+        done = relpos("simulate", *arguments, *out)
         assert done.exit_code == 2
         assert "--recordings" in done.output

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from relpos.cli import figures as command
-from relpos.cli.main import app
 from relpos.evaluation import bounds, executors, study
 from relpos.evaluation.figures import FIGURES, Work, page, save
 from relpos.evaluation.figures.sheet import key
+from support.command import relpos
 
 OWN = f"{Path(__file__).parents[1] / 'fusion' / 'own_estimators.py'}:Adder"
 WRITTEN = ("detection", "tracks-lab")
@@ -100,7 +99,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("figures") / "f"
     chosen = [word for name in WRITTEN for word in ("--figure", name)]
     options = ["--estimator", OWN, "--seeds", "2", "--workers", "1"]
-    made = CliRunner().invoke(app, ["figures", *chosen, *options, "--out", str(folder)])
+    made = relpos("figures", *chosen, *options, "--out", folder)
     assert made.exit_code == 0, made.output
     return folder
 
@@ -123,7 +122,7 @@ def test_an_estimator_of_ones_own_is_drawn_beside_ours(written: Path) -> None:
 
 
 def test_an_unknown_figure_is_wrong_usage_that_names_the_known_ones(tmp_path: Path) -> None:
-    made = CliRunner().invoke(app, ["figures", "--figure", "x", "--out", str(tmp_path)])
+    made = relpos("figures", "--figure", "x", "--out", tmp_path)
     assert made.exit_code == 2
     assert set(command.NAMES.split(", ")) == set(FIGURES)
 

@@ -11,15 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
 import relpos
-from relpos.cli.main import app
 from relpos.evaluation import report as reports
 from relpos.evaluation.report import PICTURES, drawing
 from relpos.measurements import Height, Motion, Range, Status
 from relpos.runs import NodeInfo
+from support.command import relpos as command
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 CLOSED_BY_ITSELF = {"path", "use", "rect", "image"}
@@ -90,10 +88,6 @@ class Page(HTMLParser):
             self.images.append(given)
         if tag == "data":
             self.values.append(str(given["value"]))
-
-
-def command(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

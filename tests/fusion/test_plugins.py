@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from typer.testing import CliRunner
 
 import relpos
-from relpos.cli.main import app
 from relpos.fusion import plugins
+from support.command import relpos as command
 
 OWN = Path(__file__).with_name("own_estimators.py")
 
@@ -27,10 +26,6 @@ def directory(run: relpos.Run, tmp_path_factory: pytest.TempPathFactory) -> Path
     path = tmp_path_factory.mktemp("runs") / "walk"
     relpos.save(run, path)
     return path
-
-
-def command(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def one_clear_line(result: Result) -> str:

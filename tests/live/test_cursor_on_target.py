@@ -19,9 +19,7 @@ from xml.dom.minidom import Element, parseString
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import MapFrame, Pin
@@ -30,6 +28,7 @@ from relpos.live.cot_events import Events, circle_90_m
 from relpos.live.team_view import Alert, TeamView
 from relpos.runs import read_estimates
 from relpos.tracks import estimated_tracks
+from support.command import relpos
 from support.team_views import NAMES, PLACES, UNIX_S, team_view
 from support.waiting import until
 
@@ -424,8 +423,8 @@ def test_every_member_arrives_by_udp(udp_port: socket.socket) -> None:
 
 def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -> None:
     """The whole way: a walk through the command line, its fusion and its pictures."""
-    words = ["simulate", "--scenario", "paper", "--seed", "1", "--out", str(tmp_path / "walk")]
-    made = CliRunner().invoke(app, [*words, "--set", "seconds=20", "--set", "nodes=4"])
+    words = ("simulate", "--scenario", "paper", "--seed", 1, "--out", tmp_path / "walk")
+    made = relpos(*words, "--set", "seconds=20", "--set", "nodes=4")
     assert made.exit_code == 0, made.output
     events: dict[str, Received] = {}
 
@@ -438,9 +437,10 @@ def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -
     receiver = threading.Thread(target=receive, daemon=True)
     receiver.start()
     url = f"udp://127.0.0.1:{udp_port.getsockname()[1]}"
-    words = ["fuse", str(tmp_path / "walk"), "--cot", url, "--pin", "48.1,11.5,90"]
-    more = ["--speed", "2", "--out", str(tmp_path / "out"), "--seconds", "8", "--json"]
-    done = CliRunner().invoke(app, [*words, *more])
+    done = relpos(
+        "fuse", tmp_path / "walk", "--cot", url, "--pin", "48.1,11.5,90", "--speed", 2,
+        "--out", tmp_path / "out", "--seconds", 8, "--json",
+    )  # fmt: skip
     assert done.exit_code == 0, done.output
     until(lambda: len(events) >= 4, f"only {sorted(events)} arrived")
     # It walked some time ago: the positions are not live.

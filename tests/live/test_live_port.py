@@ -8,10 +8,8 @@ from pathlib import Path
 
 import pytest
 from team_input import make_session
-from typer.testing import CliRunner
 
 from relpos import fusion
-from relpos.cli import main
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link import xbee
@@ -19,6 +17,7 @@ from relpos.link.port import Link
 from relpos.live import inputs
 from relpos.live.inputs import PortInput
 from relpos.measurements import Motion
+from support.command import relpos
 
 
 class Socket:
@@ -194,8 +193,7 @@ def test_bytes_that_arrive_together_are_received_together(socket, stream):
 
 
 def test_a_setting_that_does_not_fit_is_reported_before_the_port_is_opened(socket):
-    asked = ["fuse", str(socket.path), "--view", "--no-open", "--set", "bogus=1"]
-    result = CliRunner().invoke(main.app, asked, catch_exceptions=False)
+    result = relpos("fuse", socket.path, "--view", "--no-open", "--set", "bogus=1")
     assert result.exit_code == 1
     assert "no setting 'bogus'" in result.stderr
     assert "page" not in result.stderr

@@ -11,10 +11,8 @@ from pathlib import Path
 
 import pytest
 from team_input import TeamInput, make_session
-from typer.testing import CliRunner
 
 from relpos import fusion
-from relpos.cli import main
 from relpos.cli import mission as command
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
@@ -33,6 +31,7 @@ from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.recording import make_recorder
 from relpos.recording.about import About
+from support.command import relpos
 
 
 class Visitors(Sink):
@@ -317,7 +316,7 @@ def test_a_line_of_the_log_whose_time_is_none_is_left_out_of_the_files(tmp_path,
     lines = [json.dumps({"kind": "log", "entry": e}) for e in (strange, entry)]
     (mission.path / JOURNAL).write_text("\n".join(lines))
     path = tmp_path / log
-    done = CliRunner().invoke(main.app, ["replay", str(mission.path), "--log", str(path)])
+    done = relpos("replay", mission.path, "--log", path)
     assert "1 lines written" in done.output, done.output
     assert "to be kept" in path.read_text()
 
@@ -452,9 +451,9 @@ def test_a_start_at_one_pose_outlives_a_kill_before_the_first_checkpoint(tmp_pat
         return Outcome()
 
     monkeypatch.setattr(command, "fuse_live", session)
-    again = ["mission", str(tmp_path / "mill"), "--estimator", "deadreckoning", "--no-open"]
-    for asked in ([*again, "loop://", "--initial", "common"], again, again):
-        CliRunner().invoke(main.app, asked, catch_exceptions=False)
+    again = ("mission", tmp_path / "mill", "--estimator", "deadreckoning", "--no-open")
+    for asked in ((*again, "loop://", "--initial", "common"), again, again):
+        relpos(*asked)
     assert sessions == [(True, 0), (True, 1), (False, 0)]
 
 
@@ -476,5 +475,5 @@ def test_an_invitation_has_the_address_at_which_the_page_is_served(tmp_path, htt
     mission = Mission.open(tmp_path / "m", "/dev/null")
     mission.about.port, mission.about.https = 8460, https
     mission.save()
-    made = CliRunner().invoke(main.app, ["mission", str(mission.path), "--invite", "look"])
+    made = relpos("mission", mission.path, "--invite", "look")
     assert made.stdout.startswith("https://" if https else "http://"), made.output

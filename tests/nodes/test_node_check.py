@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from relpos.cli import node_dialogue
-from relpos.cli.main import app
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.faults import FAULTS
 from relpos.emulator.pozyx import FUNCTION_STRETCH_US
@@ -29,6 +27,7 @@ from relpos.nodes.bringup import NodeCheck, bus_access, check, inertial, radio
 from relpos.nodes.bringup import finding as finding_names
 from relpos.nodes.cable import CablePort
 from relpos.protocol import messages as wire
+from support.command import relpos
 from support.emulated_line import EmulatedCable, EmulatedLine
 
 MISSING = missing_parts()
@@ -94,7 +93,7 @@ def test_a_healthy_node_is_right_in_every_line(
 def test_a_builder_checks_a_node_over_its_cable_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     with emulated(monkeypatch, "xbee:off:node=1") as line:
         monkeypatch.setattr(node_dialogue, "open_device", lambda *_: plugged_in(monkeypatch, line))
-        done = CliRunner().invoke(app, ["node", "check", "PORT", "--cable"])
+        done = relpos("node", "check", "PORT", "--cable")
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "WRONG" not in done.stdout
     assert "started by external" in done.stdout
@@ -301,10 +300,7 @@ def test_the_page_shows_a_builders_session_on_a_simulated_uno_with_weak_pull_ups
     with emulated(monkeypatch) as line:
         line.team.nodes[1].bus.rise_ns = 700
         monkeypatch.setattr(node_dialogue, "open_device", lambda *_: line)
-        done = CliRunner().invoke(
-            app,
-            ["node", "check", "PORT", "--node", "1", "--distance", "5", "--report", str(report)],
-        )
+        done = relpos("node", "check", "PORT", "--node", 1, "--distance", 5, "--report", report)
     assert done.exit_code == 1
     page = (ROOT / "docs" / "nodes.md").read_text()
     shown = page.partition("<!-- check -->\n```\n")[2].partition("```\n<!-- /check -->")[0]

@@ -10,13 +10,12 @@ from contextlib import contextmanager
 from functools import partial
 
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.emulator.xbee import XbeeModule
 from relpos.errors import DeviceError
 from relpos.link.port import open_port
 from relpos.nodes import radio
+from support.command import relpos
 
 BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in radio.BAUD_CODES}
 
@@ -181,22 +180,21 @@ def test_other_firmware_is_named():
         radio.configure(partial(open_port, path), radio.parameters(1))
 
 
-def relpos(*arguments):
-    return CliRunner().invoke(app, ["node", "radio", *map(str, arguments)])
+node_radio = partial(relpos, "node", "radio")
 
 
 def test_the_lines_are_printed_without_a_port():
-    lines = relpos("--node", 18).stdout.splitlines()
+    lines = node_radio("--node", 18).stdout.splitlines()
     words = [line.split()[0] for line in lines]
     assert words[0] == "+++"
     assert "ATMY12" in words  # hexadecimal
     assert words[-4:] == ["ATAP2", "ATBD5", "ATWR", "ATCN"]
-    assert "ATMY0" in relpos("--coordinator").stdout
+    assert "ATMY0" in node_radio("--coordinator").stdout
 
 
 def test_the_command_writes_a_module():
     with adapter(Emulated(9)) as path:
-        done = relpos(path, "--node", 5)
+        done = node_radio(path, "--node", 5)
     assert done.exit_code == 0, done.stderr
     assert re.search(r"MY\W+9\W+5", done.stdout)
 
@@ -205,4 +203,4 @@ def test_the_command_writes_a_module():
     "arguments", [(), ("--node", 1, "--coordinator"), ("--node", 1, "--channel", "1B")]
 )
 def test_contradicting_arguments_are_wrong_usage(arguments):
-    assert relpos(*arguments).exit_code == 2
+    assert node_radio(*arguments).exit_code == 2

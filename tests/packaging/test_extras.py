@@ -1,5 +1,6 @@
 """Optional libraries: what is missing, and the line that installs it."""
 
+import json
 import os
 import shlex
 import subprocess
@@ -9,10 +10,9 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from relpos import extras
-from relpos.cli.main import app
+from support.command import relpos
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -80,32 +80,45 @@ def test_elsewhere_the_line_names_the_python_that_runs():
     assert words == [sys.executable, "-m", "pip", "install", "mcap>=1"]
 
 
-WITHOUT_MCAP = """
-import sys
-class NotInstalled:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("foxglove", "mcap"):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, NotInstalled())
+WITHOUT = """
+import json, os, sys
+from typer.testing import CliRunner
+sys.modules |= dict.fromkeys(sys.argv[1].split())
 from relpos.cli.main import app
-app(sys.argv[1:])
+for line in sys.argv[2:]:
+    done = CliRunner().invoke(app, line.split(), catch_exceptions=False)
+    print(json.dumps([done.exit_code, done.stderr, os.listdir()]))
 """
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    ["fuse a.mcap --out o", "replay a.mcap", "replay a.mcap --log l.csv",
-     "convert a.mcap --to run --out o", "report a.mcap --out o"],
-)  # fmt: skip
-def test_a_recording_without_the_extra_is_one_clear_line(arguments, tmp_path):
-    (tmp_path / "a.mcap").write_bytes(b"recorded")
+def answers(missing, commands, folder):
+    """Status, words and files after each command, of a process that lacks these packages."""
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_MCAP, *arguments.split()], cwd=tmp_path,
+        [sys.executable, "-c", WITHOUT, missing, *commands], cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=100, check=True,
     )  # fmt: skip
-    (line,) = done.stderr.splitlines()
-    assert done.returncode == 1
+    return dict(zip(commands, map(json.loads, done.stdout.splitlines()), strict=True))
+
+
+OF_RECORDINGS = (
+    "fuse a.mcap --out o", "replay a.mcap", "replay a.mcap --log l.csv",
+    "convert a.mcap --to run --out o", "report a.mcap --out o",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def without_mcap(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mcap")
+    (folder / "a.mcap").write_bytes(b"recorded")
+    return answers("foxglove mcap", OF_RECORDINGS, folder)
+
+
+@pytest.mark.parametrize("command", OF_RECORDINGS)
+def test_a_recording_without_the_extra_is_one_clear_line(command, without_mcap):
+    status, words, _ = without_mcap[command]
+    (line,) = words.splitlines()
+    assert status == 1
     assert "(extra 'recording') is not installed" in line
 
 
@@ -113,8 +126,8 @@ def test_a_recording_without_the_extra_is_one_clear_line(arguments, tmp_path):
 def test_what_a_map_needs_is_asked_for_before_the_session_begins(package, tmp_path, monkeypatch):
     monkeypatch.setattr("relpos.extras._installed", lambda line: not line.startswith(package))
     monkeypatch.setattr("relpos.fusion.warm_up", lambda name: pytest.fail("it prepares first"))
-    asked = ["fuse", "loop://", "--cot", "udp://127.0.0.1:6969", "--pin", "52,13,0"]
-    done = CliRunner().invoke(app, [*asked, "--seconds", "1", "--out", str(tmp_path / "o")])
+    asked = ("fuse", "loop://", "--cot", "udp://127.0.0.1:6969", "--pin", "52,13,0")
+    done = relpos(*asked, "--seconds", 1, "--out", tmp_path / "o")
     (line,) = done.stderr.splitlines()
     assert done.exit_code == 1
     assert package in line
@@ -122,23 +135,19 @@ def test_what_a_map_needs_is_asked_for_before_the_session_begins(package, tmp_pa
     assert not (tmp_path / "o").exists()
 
 
-WITHOUT = """
-import sys
-sys.modules[sys.argv.pop(1)] = None
-from relpos.cli.main import app
-app(sys.argv[1:])
-"""
+OF_PAGES = ("mission m loop://", "fuse loop:// --view")
 
 
-@pytest.mark.parametrize("library", ["segno", "starlette"])
-@pytest.mark.parametrize("arguments", ["mission m loop://", "fuse loop:// --view"])
-def test_a_page_without_its_libraries_is_one_clear_line_and_no_folder(library, arguments, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT, library, *arguments.split()], cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    (line,) = done.stderr.splitlines()
-    assert done.returncode == 1
+@pytest.fixture(scope="module", params=["segno", "starlette"])
+def without_page(request, tmp_path_factory):
+    return request.param, answers(request.param, OF_PAGES, tmp_path_factory.mktemp("page"))
+
+
+@pytest.mark.parametrize("command", OF_PAGES)
+def test_a_page_without_its_libraries_is_one_clear_line_and_no_folder(command, without_page):
+    library, told = without_page
+    status, words, files = told[command]
+    (line,) = words.splitlines()
+    assert status == 1
     assert f"{library} (extra 'view') is not installed" in line
-    assert not list(tmp_path.iterdir())
+    assert not files

@@ -10,15 +10,14 @@ import lzma
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli import main
 from relpos.link.decoder import Decoder
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.recording import open_recording
 from relpos.recording.replay import Replay
 from relpos.runs import save_run
+from support.command import relpos
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 OLD_FRAMES = {
@@ -99,10 +98,7 @@ def test_a_recording_of_an_earlier_version_gives_the_measurements_of_then_to_the
 
 def test_a_recording_of_an_earlier_version_is_fused(recorded, tmp_path):
     version, path = recorded
-    done = CliRunner().invoke(
-        main.app,
-        ["fuse", str(path), "--initial", "common", "--no-report", "--out", str(tmp_path / "out")],
-    )
+    done = relpos("fuse", path, "--initial", "common", "--no-report", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     assert f"recorded by relpos {version}" in done.stderr
     assert len((tmp_path / "out" / "estimate.csv").read_text().splitlines()) > 20

@@ -12,21 +12,16 @@ import tty
 
 import pytest
 from sessions import serial_bytes
-from typer.testing import CliRunner
 
-from relpos.cli import main
 from relpos.link.xbee import virtual_time
 from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import open_recording
 from relpos.recording.replay import Replay
 from relpos.recording.topics import Serial
 from relpos.sources import load
+from support.command import relpos
 
 PATIENCE_S = 200.0
-
-
-def relpos(*arguments):
-    return CliRunner().invoke(main.app, list(map(str, arguments)), catch_exceptions=False)
 
 
 def bytes_recorded(path):

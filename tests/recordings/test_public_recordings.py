@@ -5,13 +5,12 @@ import zipfile
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.errors import DataError
 from relpos.recordings import catalog, download, handheld, lowerback
 from relpos.recordings.tables import Archive
 from relpos.runs import load_run
+from support.command import relpos
 
 TRIAL = {
     "Height": 175.0,
@@ -42,8 +41,8 @@ def no_checksum(monkeypatch):
 
 def test_a_lower_back_trial_becomes_a_run(lowerback_source, no_checksum, tmp_path):
     out = tmp_path / "out"
-    arguments = ["recordings", "get", "walk_lowerback_20m", "--out", str(out)]
-    done = CliRunner().invoke(app, [*arguments, "--mirror", str(lowerback_source)])
+    arguments = ("recordings", "get", "walk_lowerback_20m", "--out", out)
+    done = relpos(*arguments, "--mirror", lowerback_source)
     assert done.exit_code == 0, done.output
     assert "AGPL-3.0" in done.output
     run = load_run(out / "1-1")
@@ -102,11 +101,11 @@ def test_a_source_that_moved_gives_one_clear_line(monkeypatch, tmp_path):
 
 
 def test_every_set_is_listed_with_licence_and_source():
-    done = CliRunner().invoke(app, ["recordings", "list", "--json"])
+    done = relpos("recordings", "list", "--json")
     listed = json.loads(done.output)
     assert len(listed) == len(catalog.SOURCES)
     for entry in listed.values():
         assert entry["licence"]
         assert entry["address"].startswith("https://")
-    shown = CliRunner().invoke(app, ["recordings", "list"]).output
+    shown = relpos("recordings", "list").output
     assert all(name in shown for name in listed)

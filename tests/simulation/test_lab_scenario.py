@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.errors import RelposError
 from relpos.evaluation import executors, study
 from relpos.evaluation.study import Case
 from relpos.measurements import Motion, Range
 from relpos.runs import load_run
 from relpos.simulation import lab, scenarios
+from support.command import relpos
 
 QUIET = {"noise_scale": 0, "sigma_range_m": 0, "wall_delay_max_m": 0, "body_delay_max_m": 0,
          "reflection": 0}  # fmt: skip
@@ -103,9 +102,7 @@ def test_everything_is_a_function_of_settings_and_seed() -> None:
 
 
 def test_presses_name_the_landmark_that_was_passed(tmp_path: Path) -> None:
-    made = CliRunner().invoke(
-        app, ["simulate", "--scenario", "lab", "--seed", "4", "--out", str(tmp_path / "run")]
-    )
+    made = relpos("simulate", "--scenario", "lab", "--seed", 4, "--out", tmp_path / "run")
     assert made.exit_code == 0, made.output
     run = load_run(tmp_path / "run")
     assert len(run.landmarks) == 112

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from relpos.cli.main import app
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, Parameter, pairs_of
 from relpos.measurements import Event, Motion, Prior, Range, Truth
 from relpos.runs import Description, Landmark, NodeInfo, Run, save_run, write_estimates
+from support.command import relpos
 
 SECONDS = 40
 NAMES = {1: "Åsa", 2: "Kim", 3: "Li & Söhne", 4: None}
@@ -94,9 +94,7 @@ class CommandResult:
     """What a command printed and how it ended."""
 
     def __init__(self, *words: object) -> None:
-        from typer.testing import CliRunner
-
-        result = CliRunner().invoke(app, [str(word) for word in words])
+        result = relpos(*words)
         self.status = result.exit_code
         self.files = [Path(line) for line in result.stdout.splitlines()]
         self.remarks = result.stderr.splitlines()

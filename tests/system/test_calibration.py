@@ -9,13 +9,12 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from relpos.cli.main import app
 from relpos.emulator.node import draw_uncalibrated_errors
 from relpos.link.dialogue import NodeDialogue
 from relpos.link.port import open_port
 from relpos.protocol import messages as wire
+from support.command import relpos
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 
@@ -36,7 +35,7 @@ def emulated(scenario, speed, seconds, seed=3, nodes=1):
 
 
 def calibrate(*arguments):
-    return CliRunner().invoke(app, ["node", "calibrate", *map(str, arguments), "--yes"])
+    return relpos("node", "calibrate", *arguments, "--yes")
 
 
 @pytest.mark.soak

@@ -17,10 +17,8 @@ import tty
 from collections import Counter
 
 import pytest
-from typer.testing import CliRunner
 
 import relpos
-from relpos.cli import main
 from relpos.emulator.serving import record_team
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.evaluation.summary import FIGURES
@@ -31,6 +29,7 @@ from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, save_run
 from shared_data import DATA
+from support.command import relpos as command
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 PATIENCE_S = 120
@@ -49,7 +48,7 @@ def start(*arguments):
 
 def figures_of(*arguments):
     """What a command prints with --json, run in this process: imports take longer than most."""
-    done = CliRunner().invoke(main.app, [*map(str, arguments), "--json"], catch_exceptions=False)
+    done = command(*arguments, "--json")
     assert done.exit_code == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -241,8 +240,7 @@ def listen_until_it_vanishes(port, stream, out, *options):
 
     feeding = threading.Thread(target=feed)
     feeding.start()
-    words = ["fuse", port.path, "--out", str(out), *options]
-    done = CliRunner().invoke(main.app, words, catch_exceptions=False)
+    done = command("fuse", port.path, "--out", out, *options)
     feeding.join()
     assert "Traceback" not in done.stderr
     return done
@@ -280,8 +278,7 @@ def test_a_port_is_not_fused_into_the_folder_of_an_earlier_session(tmp_path, tea
     listen_until_it_vanishes(port, team_bytes, tmp_path / "out")
     kept = (tmp_path / "out" / "received" / "motion.csv").read_bytes()
     again = Port()
-    words = ["fuse", again.path, "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(main.app, words)
+    done = command("fuse", again.path, "--out", tmp_path / "out")
     again.vanish()
     assert done.exit_code == 1
     assert "holds what an earlier session received" in done.stderr
@@ -359,8 +356,8 @@ def assert_evaluate_agrees(run, out, fused):
 
 def test_a_simulated_run_is_scored_alike_by_fuse_and_by_evaluate(tmp_path):
     run, out = tmp_path / "run", tmp_path / "out"
-    words = ["simulate", "--scenario", "paper", "--seed", "3", "--set", "seconds=200"]
-    simulated = CliRunner().invoke(main.app, [*words, "--out", str(run)], catch_exceptions=False)
+    words = ("simulate", "--scenario", "paper", "--seed", 3, "--set", "seconds=200")
+    simulated = command(*words, "--out", run)
     assert simulated.exit_code == 0, simulated.stderr
     fused = figures_of("fuse", run, "--estimator", "particle", "--out", out)
     plain_m = fused["dead_reckoning"]["relative_distance_rmse_m"]

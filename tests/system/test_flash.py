@@ -14,10 +14,8 @@ from types import SimpleNamespace
 
 import pytest
 from boot_loaders import ADDRESSES, MEGA_LOADER, build_optiboot, mega_loader, needs
-from typer.testing import CliRunner
 
 from relpos.cli import node_flash
-from relpos.cli.main import app
 from relpos.emulator.avr.board import BOARDS as SIMULATED
 from relpos.emulator.avr.board import Board, ResetCause
 from relpos.errors import DeviceError
@@ -25,6 +23,7 @@ from relpos.link import dialogue
 from relpos.link import port as link_port
 from relpos.link.port import open_port
 from relpos.nodes import boards, upload
+from support.command import relpos
 
 MILLISECOND_CYCLES = 16_000
 ANSWER_MS = 20
@@ -140,32 +139,28 @@ def plugged(kind, firmware, *, connected=True):
             raise arduino.failure
 
 
-def relpos_node(*arguments):
-    return CliRunner().invoke(app, ["node", *map(str, arguments)])
-
-
 def test_a_board_becomes_a_node_and_answers_over_its_cable(optiboot, tmp_path):
     key = tmp_path / "team.key"
     key.write_text("00112233445566778899aabbccddeeff\n")
     with plugged("uno", optiboot) as uno:
-        done = relpos_node("flash", uno.path, "--board", "uno", "--id", 9, "--key-file", key)
+        done = relpos("node", "flash", uno.path, "--board", "uno", "--id", 9, "--key-file", key)
         assert done.exit_code == 0, done.stdout + done.stderr
         assert re.search(r"written and verified \([1-9]\d{4} bytes\)", done.stdout)
         assert "has been given the key" in done.stdout
         assert "node 1 is node 9 now" in done.stdout
         assert "node 9 answers over the cable" in done.stdout
         # And goes on doing so, under its key alone.
-        shown = relpos_node("set", uno.path, "--cable", "--key-file", key, "led", "on")
+        shown = relpos("node", "set", uno.path, "--cable", "--key-file", key, "led", "on")
         assert shown.exit_code == 0, shown.stderr
         assert "Node 9" in shown.stdout
-        stranger = relpos_node("set", uno.path, "--cable")
+        stranger = relpos("node", "set", uno.path, "--cable")
         assert stranger.exit_code == 1
         assert "under another key" in stranger.stderr
 
 
 def test_the_wrong_board_is_refused_before_anything_is_written(optiboot):
     with plugged("uno", optiboot) as uno:
-        done = relpos_node("flash", uno.path, "--board", "mega")
+        done = relpos("node", "flash", uno.path, "--board", "mega")
         assert done.exit_code == 1
         assert len(done.stderr.strip().splitlines()) == 1
         assert "this is an Arduino uno (ATmega328P), not a mega" in done.stderr
@@ -204,7 +199,7 @@ def test_a_boot_loader_that_leaves_the_watchdog_armed_is_told(tmp_path, of_2011)
 @pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
 def test_a_mega_becomes_a_node_as_well(tmp_path):
     with plugged("mega", mega_loader()) as mega:
-        done = relpos_node("flash", mega.path, "--id", 5)
+        done = relpos("node", "flash", mega.path, "--id", 5)
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "Arduino mega (ATmega2560)" in done.stdout
     assert "node 5 answers over the cable" in done.stdout
@@ -212,7 +207,7 @@ def test_a_mega_becomes_a_node_as_well(tmp_path):
 
 def test_the_shields_switch_in_the_wrong_position_is_reported(optiboot):
     with plugged("uno", optiboot, connected=False) as uno:
-        done = relpos_node("flash", uno.path)
+        done = relpos("node", "flash", uno.path)
     assert done.exit_code == 1
     assert len(done.stderr.strip().splitlines()) == 1
     assert "no board answers" in done.stderr

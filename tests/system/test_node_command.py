@@ -7,18 +7,18 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
+from functools import partial
 
 import pytest
-from typer.testing import CliRunner
 
 from relpos.cli import node_dialogue, node_set, node_watch
-from relpos.cli.main import app
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import dialogue
 from relpos.link import port as link_port
 from relpos.link.authentication import write_new_key
 from relpos.link.port import open_port
+from support.command import relpos
 from support.emulated_line import EmulatedLine
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
@@ -61,8 +61,7 @@ def team(line, monkeypatch):
     return line.port
 
 
-def node(*arguments):
-    return CliRunner().invoke(app, ["node", *map(str, arguments)])
+node = partial(relpos, "node")
 
 
 def test_list_shows_every_node(team):
