@@ -84,12 +84,11 @@ class Bound:
             return self.smoothing_distance_m, self.smoothing_position_m
         return self.filtering_distance_m, self.filtering_position_m
 
-    def totals(self, first_s: float = -math.inf, last_s: float = math.inf) -> Totals:
-        """Root mean squares over the times from ``first_s`` to ``last_s``."""
-        there = (self.time_s >= first_s) & (self.time_s <= last_s)
+    def totals(self) -> Totals:
+        """Root mean squares over all times."""
         return Totals(
             *(
-                float(_rms(series[there]))
+                float(_rms(series))
                 for series in (
                     self.filtering_pair_m,
                     self.filtering_position_m,
