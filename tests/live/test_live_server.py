@@ -376,3 +376,23 @@ def test_a_session_that_ends_ends_its_pages():
     session = asyncio.run(listen())
     assert session.over
     assert session.names == {"1": "Kim"}
+
+
+def test_a_page_that_answers_has_one_picture_on_its_way_whatever_the_network_holds_back(stage):
+    address = stage.access.url("/ws").replace("http", "ws", 1) + "&answers"
+    with connect(address, open_timeout=PATIENCE_S) as page:
+
+        def seqs(until_s):
+            end, found = time.monotonic() + until_s, []
+            while (left := end - time.monotonic()) > 0:
+                with contextlib.suppress(TimeoutError):
+                    message = json.loads(page.recv(timeout=left))
+                    found += [message["seq"]] if message["type"] == "picture" else []
+            return found
+
+        assert len(seqs(1.0)) == 1
+        before = stage.seq
+        page.send("")
+        # The newest one then, not those between.
+        assert len(found := seqs(1.0)) == 1
+        assert found[0] >= before - 1

@@ -58,6 +58,7 @@ class Stage:
         self.frozen = False
         self.recorded_unix_s: float | None = None
         """Unix time of second 0 of a recording that is played; None: the team is live."""
+        self.hello_name = "Drill at the old mill"
         self.mute = False
         """The server is connected, but not a word comes."""
         self.sent: dict[int, float] = {}
@@ -114,7 +115,7 @@ class Stage:
         self._token = access.token
         self.access = access
         hello = Hello(
-            "Drill at the old mill",
+            self.hello_name,
             "/dev/ttyUSB0",
             "bank",
             self.started_unix_s,
@@ -122,6 +123,13 @@ class Stage:
             recorded_unix_s=self.recorded_unix_s,
         )
         self.web: WebView | None = WebView(listener, access, hello)
+
+    def set_board(self, event: dict[str, Any]) -> None:
+        """As if somebody else had changed the board."""
+        with self._lock:
+            self.board.apply({"unix_s": time.time(), "by": "Somebody", **event})
+            if self.web is not None:
+                self.web.boarded(self.board.to_message())
 
     def shut(self) -> None:
         """Stop serving; the team goes on."""

@@ -91,6 +91,7 @@ class SessionProxy:
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self.hello: str | None = None
         self.view: str | None = None
+        self._view_s = 0.0
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
         self.log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
@@ -116,6 +117,7 @@ class SessionProxy:
     def _handle(self, line: str) -> None:
         if line.startswith('{"type":"picture"'):
             self.view = line.rstrip("\n")
+            self._view_s = time.monotonic()
             self._notify()
             return
         message = json.loads(line)
@@ -142,6 +144,11 @@ class SessionProxy:
                 waiting = self._answers.pop(message["id"], None)
                 if waiting is not None and not waiting.done():
                     waiting.set_result(message)
+
+    @property
+    def view_age_s(self) -> float | None:
+        """How long ago the newest view came."""
+        return None if self.view is None else round(time.monotonic() - self._view_s, 2)
 
     def _notify(self) -> None:
         self._news.set()
@@ -256,20 +263,27 @@ class Pages:
         return Response(self._code, media_type="image/svg+xml")
 
     async def follow(self, socket: WebSocket) -> None:
-        """Send hello, the tracks, then every view, or as many as the browser takes."""
+        """Send hello, the tracks, then every view, or as many as the browser takes.
+
+        To a page, which answers each view (``/ws?answers``), the next one is sent after that: none
+        grows old in the network, where megabytes would wait, and come as if they were of now.
+        """
         await socket.accept()
-        gone = asyncio.create_task(_until_gone(socket))
+        browser = _Browser(socket)
+        gone = asyncio.create_task(browser.listen())
         try:
             hello = await self.session.until_hello()
             if hello is None:
                 return
             await socket.send_text(hello)
             await socket.send_text(self.session.tracks.to_json())
-            await socket.send_text(to_json({"type": "you", "role": str(role_of(socket))}))
+            you = {"role": str(role_of(socket)), "view_age_s": self.session.view_age_s}
+            await socket.send_text(to_json({"type": "you", **you}))
             seen: str | None = None
             told, kept = 0, dict[str, str]()
             while not gone.done() and not self.session.over and not self._is_revoked(socket):
-                newest = await self.session.news(seen, PING_S)
+                ready = await browser.is_ready(PING_S)
+                newest = await self.session.news(seen, PING_S) if ready else None
                 for kind, line in list(self.session.kept.items()):
                     if kept.get(kind) is not line:
                         kept[kind] = line
@@ -277,8 +291,10 @@ class Pages:
                 if new := self.session.logged - told:
                     entries, told = list(self.session.log)[-new:], self.session.logged
                     await socket.send_text(to_json({"type": "log", "entries": entries}))
+                if newest is not None:
+                    seen = newest
+                    browser.ready.clear()
                 await socket.send_text(newest if newest is not None else '{"type":"ping"}')
-                seen = newest if newest is not None else seen
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:
@@ -476,10 +492,27 @@ class Pages:
         return JSONResponse(answer["reply"], answer.get("status", 200))
 
 
-async def _until_gone(socket: WebSocket) -> None:
-    """Wait until the browser has left; whatever it sends is nothing to us."""
-    while (await socket.receive())["type"] != "websocket.disconnect":
-        pass
+class _Browser:
+    """What a browser says: of a page whatever it sends means that it has the newest view."""
+
+    def __init__(self, socket: WebSocket) -> None:
+        self._socket = socket
+        self._answers = "answers" in socket.query_params
+        self.ready = asyncio.Event()
+        self.ready.set()
+
+    async def listen(self) -> None:
+        """Listen until it has left."""
+        while (await self._socket.receive())["type"] != "websocket.disconnect":
+            self.ready.set()
+        self.ready.set()
+
+    async def is_ready(self, within_s: float) -> bool:
+        """Wait for its answer; False where none comes in time."""
+        if self._answers:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self.ready.wait(), within_s)
+        return self.ready.is_set() or not self._answers
 
 
 async def _refuse(_: Request, error: Exception) -> Response:

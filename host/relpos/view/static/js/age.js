@@ -6,6 +6,19 @@ export const LINK_LOST_S = 3.5;
 export const WALKING_M_S = 1.4;
 const BEAT_MS = 500;
 
+/**
+ * This moment, or one `agoS` before. By two clocks: one may be set, the other may stand still while
+ * the device sleeps.
+ */
+export function moment(agoS = 0) {
+  return { wallMs: Date.now() - 1000 * agoS, steadyMs: performance.now() - 1000 * agoS };
+}
+
+/** Seconds since then, by the clock that says more: nothing looks newer than it is. */
+export function sinceS({ wallMs, steadyMs }) {
+  return Math.max(Date.now() - wallMs, performance.now() - steadyMs) / 1000;
+}
+
 /** Whether a person's values are of now. */
 export function isFresh(person) {
   return person != null && person.status !== "stale" && person.status !== "lost";

@@ -24,7 +24,7 @@ const MANY = 3;
  * {raised, cleared}. A warning that becomes an alarm is raised, and must be acknowledged, again.
  */
 export class Alarms {
-  constructor(now = () => Date.now()) {
+  constructor(now = () => performance.now()) {
     this.now = now;
     this.clear();
   }

@@ -60,7 +60,7 @@ export class BoardView {
     if (on) this.find(node);
   }
 
-  update(nowMs = Date.now()) {
+  update(nowMs = this.team.nowMs) {
     this.showRollCall(nowMs);
     this.showEvacuation();
     const { people = {}, evacuation, roll_call: call } = this.board;

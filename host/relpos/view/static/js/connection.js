@@ -1,11 +1,12 @@
 // The WebSocket: reconnects by itself, tells silence from loss, and notices sleep.
 
+import { moment, sinceS } from "./age.js";
 import { delayS, judge, SILENT_S } from "./backoff.js";
 
 const TICK_MS = 500;
 
 /**
- * `onMessage(object)` gets every message, `onState(state)` every change of it: "connecting",
+ * `onMessage(object, ageS)` gets every message, and how old it is at most; `onState(state)` every change of it: "connecting",
  * "live", "silent" (connected, but nothing comes), "waiting" (until the next attempt) or "refused"
  * (the server does not know our token).
  */
@@ -17,8 +18,10 @@ export class Connection {
     this.failures = 0;
     this.unreadable = 0;
     this.socket = null;
-    this.heardMs = null;
-    this.retryMs = 0;
+    this.heard = null;
+    this.failed = null;
+    this.delayS = 0;
+    this.askedFor = null;
     this.tickMs = Date.now();
   }
 
@@ -35,13 +38,13 @@ export class Connection {
   /** Seconds until the next attempt, rounded up; null while none is due. */
   get retryS() {
     return this.state === "waiting" || this.state === "refused"
-      ? Math.max(0, Math.ceil((this.retryMs - Date.now()) / 1000))
+      ? Math.max(0, Math.ceil(this.delayS - sinceS(this.failed)))
       : null;
   }
 
   /** Try at once: by hand, or after sleep. */
   wake() {
-    const silent = this.heardMs === null || Date.now() - this.heardMs > SILENT_S * 1000;
+    const silent = this.heard === null || sinceS(this.heard) > SILENT_S;
     const resting = this.state === "waiting" || this.state === "refused";
     if (resting || (silent && this.state !== "connecting")) {
       this.failures = 0;
@@ -52,14 +55,16 @@ export class Connection {
   open() {
     this.close();
     this.set("connecting");
-    const address = new URL("/ws", location.href);
+    const address = new URL("/ws?answers", location.href);
     address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
     const socket = new WebSocket(address);
     this.socket = socket;
-    this.openedMs = Date.now();
+    this.opened = moment();
+    // The first view was made before it is asked for, by so much as the server says.
+    this.askedFor = this.opened;
     socket.onmessage = (event) => {
       if (socket !== this.socket) return;
-      this.heardMs = Date.now();
+      this.heard = moment();
       this.failures = 0;
       this.set("live");
       let message;
@@ -69,7 +74,12 @@ export class Connection {
         this.unreadable += 1;
         return;
       }
-      this.onMessage(message);
+      if (message.type === "you") this.askedFor = moment(sinceS(this.opened) + (message.view_age_s ?? 0));
+      this.onMessage(message, sinceS(this.askedFor));
+      if (message.type !== "picture") return;
+      // The next one is made after this word: no older than the time since.
+      this.askedFor = moment();
+      if (socket.readyState === WebSocket.OPEN) socket.send("");
     };
     socket.onclose = () => {
       if (socket === this.socket) this.fail();
@@ -84,7 +94,8 @@ export class Connection {
 
   fail() {
     this.close();
-    this.retryMs = Date.now() + 1000 * delayS(this.failures);
+    this.failed = moment();
+    this.delayS = delayS(this.failures);
     this.failures += 1;
     this.set("waiting");
     // A refusal looks like any other failure to a WebSocket.
@@ -103,11 +114,11 @@ export class Connection {
     if (slept) {
       this.wake();
     } else if (this.state === "waiting" || this.state === "refused") {
-      if (now >= this.retryMs) this.open();
+      if (sinceS(this.failed) >= this.delayS) this.open();
     } else if (this.state === "connecting") {
-      if (now - this.openedMs > 8000) this.fail();
+      if (sinceS(this.opened) > 8) this.fail();
     } else {
-      const judged = judge((now - this.heardMs) / 1000);
+      const judged = judge(sinceS(this.heard));
       if (judged === "dead") this.fail();
       else this.set(judged);
     }

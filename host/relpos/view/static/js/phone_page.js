@@ -34,7 +34,6 @@ const queue = new PressQueue(store);
 const others = new Map();
 let me = readMe();
 let page = me ? "landmarks" : "me";
-let receivedMs = null;
 let offset = null; // {offsetMs, roundTripMs, atMs}
 let comparing = false;
 let sending = false;
@@ -77,23 +76,22 @@ function readMe() {
 
 // -- messages --------------------------------------------------------------------------------------
 
-function handle(message) {
-  const kind = team.handle(message);
+function handle(message, ageS) {
+  const kind = team.handle(message, ageS);
   if (kind === "hello") {
     alarms.clear();
     trouble = null;
     introduce();
-    document.title = t(team.replayed ? "title.wearer.replay" : "title.wearer", { name: team.session.name ?? "" });
+    link.setTitle(t(team.replayed ? "title.wearer.replay" : "title.wearer", { name: team.session.name ?? "" }));
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
   } else if (kind === "board") {
     showOrders(message);
     nameFloors(message.floors);
   } else if (kind === "picture") {
-    receivedMs = Date.now();
+    watchLink();
     const { raised, cleared } = alarms.update(team.list());
     if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${levelWords(a.level)}: ${words(a)}`).join(". "));
     if (cleared.length) setText(byId("voice"), cleared.map((a) => t("cleared.phone", { name: a.name })).join(". "));
-    link.update(0, receivedMs);
     if (team.replayed && raised.length) siren.sound(null);
     sound();
     banner.update(alarms);
@@ -140,14 +138,16 @@ function sound() {
   siren.sound(kind && team.replayed ? "replay" : kind);
 }
 
+function watchLink() {
+  link.update(team.lagS, team.unixS);
+  if (link.lost) team.age(team.lagS);
+}
+
 /** The age of what is shown counts on while nothing comes. */
 function beat() {
   showAge();
-  if (receivedMs === null) return;
-  const lagS = Math.max(0, Date.now() - receivedMs) / 1000;
-  link.update(lagS, receivedMs);
+  watchLink();
   if (!link.lost) return;
-  team.age(lagS);
   alarms.update(team.list());
   banner.update(alarms);
   sound();
@@ -236,7 +236,7 @@ function showMe() {
 }
 
 function showAge() {
-  const age = dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs, nowMs: Date.now() });
+  const age = dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
   const status = team.replayed ? replayWords(connection.state, team.session, team.timeS)
     : connectionWords(connection.state, age, connection.retryS);
   showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, status);

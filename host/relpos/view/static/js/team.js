@@ -1,6 +1,6 @@
 // The newest view of the team, and what follows from it; fed by the server's messages (protocol 1).
 
-import { aged } from "./age.js";
+import { aged, moment, sinceS } from "./age.js";
 import { t } from "./i18n.js";
 import { nodeName } from "./words.js";
 import { pairKey, relation } from "./relation.js";
@@ -42,17 +42,19 @@ export class Team {
     this.timeS = null;
     this.unixS = null;
     this.arrivedUnixS = null;
+    /** When the newest view was made, at the earliest. */
+    this.viewedAt = null;
     this.seq = null;
     this.order = [];
     this.pictures = 0;
   }
 
-  /** Handle a message; returns its type, or "unknown" for one that this page cannot read. */
-  handle(message) {
+  /** Handle a message that is at most `ageS` old; returns its type, or "unknown" for one that this page cannot read. */
+  handle(message, ageS = 0) {
     switch (message?.type) {
       case "hello": {
         const other = message.session?.started_unix_s !== this.session?.started_unix_s;
-        if (other) this.clear();
+        if (other || message.session?.waiting) this.clear();
         this.session = message.session ?? {};
         this.limits = { ...this.limits, ...message.limits };
         return message.protocol === PROTOCOL ? "hello" : "unknown";
@@ -70,6 +72,7 @@ export class Team {
         }));
         return "smoothed";
       case "picture":
+        this.viewedAt = moment(ageS);
         this.handleView(message);
         return "picture";
       case "log":
@@ -109,6 +112,17 @@ export class Team {
         this.trackOf(person.node).add(picture.time_s, person.x_m, person.y_m);
       }
     }
+  }
+
+  /** Seconds since the newest view; null before the first. */
+  get lagS() {
+    return this.viewedAt && sinceS(this.viewedAt);
+  }
+
+  /** The session's time of day in ms: this device's own may be wrong. In a replay the recording's. */
+  get nowMs() {
+    if (this.replayed) return 1000 * ((this.session.recorded_unix_s ?? 0) + (this.timeS ?? 0));
+    return this.viewedAt ? 1000 * (this.unixS + this.lagS) : Date.now();
   }
 
   /** Make everything `lagS` older than it was in the newest view. */

@@ -32,7 +32,6 @@ const by = () => t("commander");
 const store = storage();
 const team = new Team();
 const alarms = new Alarms();
-let receivedMs = null;
 let listMs = 0;
 let listTimer = null;
 let tableMs = 0;
@@ -76,21 +75,20 @@ const connection = new Connection({ onMessage: handle, onState: () => refresh(tr
 
 // -- messages --------------------------------------------------------------------------------------
 
-function handle(message) {
-  const kind = team.handle(message);
+function handle(message, ageS) {
+  const kind = team.handle(message, ageS);
   if (kind === "hello") {
-    receivedMs = null;
     trouble = null;
     alarms.clear();
     log.clear();
     setText(byId("session"), team.session.emulated ? t("session.emulated", { name: team.session.name }) : team.session.name);
-    document.title = t(team.replayed ? "title.replay" : "title.live", { name: team.session.name ?? "" });
+    link.setTitle(t(team.replayed ? "title.replay" : "title.live", { name: team.session.name ?? "" }));
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
     byId("end").hidden = team.replayed && !team.session.mission;
     source.show(Boolean(team.session.waiting));
     setAttribute(document.documentElement, "data-waiting", team.session.waiting ? "true" : null);
     if (team.session.waiting) {
-      link.update(0, null);
+      link.update(null);
       document.querySelectorAll("dialog[open]").forEach((dialog) => dialog.close());
     }
     showWayToLive(team.session.live_port);
@@ -113,10 +111,9 @@ function handle(message) {
   } else if (kind === "tracks") {
     map.layer.forget();
   } else if (kind === "picture") {
-    receivedMs = Date.now();
     takeAlarms();
     map.alarms = alarms.active;
-    link.update(0, receivedMs);
+    watchLink();
     timeline.show(team.timeS);
     findView.update(team);
   } else if (kind === "unknown") {
@@ -152,13 +149,15 @@ function linkChanged(lost) {
   sound();
 }
 
+function watchLink() {
+  link.update(team.lagS, team.unixS);
+  if (link.lost) team.age(team.lagS);
+}
+
 function beat() {
   if (siren.state === "muted") showSound();
-  if (receivedMs === null) return showAge();
-  const lagS = Math.max(0, Date.now() - receivedMs) / 1000;
-  link.update(lagS, receivedMs);
+  watchLink();
   if (!link.lost) return showAge();
-  team.age(lagS);
   alarms.update(team.list());
   banner.update(alarms);
   sound();
@@ -228,7 +227,7 @@ function showTable() {
 }
 
 function age() {
-  return dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs, nowMs: Date.now() });
+  return dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
 }
 
 function showAge() {
