@@ -46,6 +46,7 @@ export class BoardView {
     return this.team.wearers().map(({ node }) => node).filter((node) => (this.board.people?.[node]?.team ?? "") === name);
   }
 
+  /** Never rejected. */
   async post(kind, body) {
     try {
       await postJson(`/api/${kind}`, { ...body, by: this.by() });
@@ -73,6 +74,11 @@ export class BoardView {
       select.dataset.shown = teams.join();
       select.replaceChildren(...teams.map((name) => make("option", { value: name, text: name })));
     }
+    for (const [node, row] of this.rows) {
+      if (this.team.person(node)) continue;
+      row.element.remove();
+      this.rows.delete(node);
+    }
     byId("evacuate-team").disabled = select.disabled = !teams.length;
     const wearers = this.team.wearers();
     for (const [node, row] of this.rows) row.element.hidden = !wearers.some((person) => person.node === node);
@@ -84,7 +90,7 @@ export class BoardView {
       for (const name of FIELDS) {
         setAttribute(row[name], "aria-label", t(`board.${name}.of`, { node: person.node }));
         const value = name === "air" ? place.air_bar ?? "" : place[name] ?? "";
-        if (document.activeElement !== row[name] && row[name].value !== String(value)) row[name].value = value;
+        if (!row.edited.has(row[name]) && row[name].value !== String(value)) row[name].value = value;
       }
       setText(row.time, Number.isFinite(place.entered_unix_s)
         ? `${timeOfDay(1000 * place.entered_unix_s)}, ${duration(nowMs / 1000 - place.entered_unix_s)}` : "–");
@@ -112,13 +118,22 @@ export class BoardView {
   }
 
   make(node) {
+    // What is typed here stays until it is sent; after that, and else, what the session has is shown.
+    const edited = new Set();
     const field = (name, attributes) => {
       const input = make(name === "state" ? "select" : "input", attributes);
-      input.addEventListener("change", () => this.post("board", name === "air"
-        ? { node, air_bar: input.value === "" ? null : Number(input.value) } : { node, [name]: input.value }));
+      input.addEventListener("input", () => edited.add(input));
+      input.addEventListener("blur", () => input.dataset.sending || edited.delete(input));
+      input.addEventListener("change", async () => {
+        input.dataset.sending = "true";
+        await this.post("board", name === "air"
+          ? { node, air_bar: input.value === "" ? null : Number(input.value) } : { node, [name]: input.value });
+        delete input.dataset.sending;
+        edited.delete(input);
+      });
       return input;
     };
-    const row = { name: make("span"), time: make("td"), contact: make("td"), airAge: make("span", { class: "soft" }),
+    const row = { edited, name: make("span"), time: make("td"), contact: make("td"), airAge: make("span", { class: "soft" }),
       answer: make("span"), order: make("span"), team: field("team", { size: 6, maxlength: 40 }), sector: field("sector", { size: 6, maxlength: 40 }),
       task: field("task", { size: 10, maxlength: 40 }), state: field("state", {}), air: field("air", { type: "number", min: 0, max: 400, step: 5 }) };
     row.state.append(...STATES.map((value) => make("option", { value, "data-t": `board.state.${value || "none"}` })));
@@ -187,12 +202,14 @@ export function hold(button, action) {
       action();
     }, HOLD_MS);
   };
+  button.classList.add("hold");
   button.addEventListener("pointerdown", start);
   for (const end of ["pointerup", "pointerleave", "pointercancel", "blur", "keyup"]) button.addEventListener(end, stop);
   button.addEventListener("keydown", (event) => {
     if (event.key === "Enter" || event.key === " ") {
       event.preventDefault();
-      start();
+      // A key that stays down is one hold: a second would end the MAYDAY that it has called.
+      if (!event.repeat) start();
     }
   });
 }

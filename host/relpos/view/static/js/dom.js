@@ -40,6 +40,9 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** The server itself waits five seconds for the session. */
+const ANSWER_MS = 8000;
+
 const SVG = "http://www.w3.org/2000/svg";
 
 // Shapes differ where colours do: a disc, a triangle, an octagon, as on signs.
@@ -127,14 +130,20 @@ export async function refusal(answer) {
   return said(reply?.said, reply?.error);
 }
 
+/** Its errors say by `again` whether the same may succeed later. */
 export async function postJson(address, body) {
   const answer = await fetch(address, {
     method: "POST",
     headers: { "content-type": "application/json" },
     body: JSON.stringify(body),
+    // A network that swallows everything would be waited for, for minutes, without a word.
+    signal: AbortSignal.timeout(ANSWER_MS),
+  }).catch(() => {
+    throw Object.assign(new Error(t("server.silent")), { again: true });
   });
   if (!answer.ok) {
-    throw new Error(await refusal(answer) ?? t("server.answered", { status: answer.status }));
+    const again = answer.status === 429 || answer.status >= 500;
+    throw Object.assign(new Error(await refusal(answer) ?? t("server.answered", { status: answer.status })), { again });
   }
   return answer.json();
 }

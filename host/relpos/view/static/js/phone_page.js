@@ -26,6 +26,7 @@ import { alarmText, clock, compass, directionWords, distance, levelWords, nodeNa
 
 const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
+const MAYDAY_AGAIN_MS = 2000;
 
 const store = storage();
 const team = new Team();
@@ -42,6 +43,8 @@ let listMs = -Infinity;
 let lastPress = null;
 let trouble = null;
 let orders = null;
+let maydayHad = false;
+let maydayTimer = null;
 
 const siren = new Siren(showSound);
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), () => sound());
@@ -106,6 +109,10 @@ function handle(message, ageS) {
 function showOrders(board) {
   orders = board;
   const node = me?.node;
+  // The session has it, whatever became of the answer.
+  if (board.mayday?.[node]) setText(byId("mayday-words"), t("mayday.sent"));
+  else if (maydayHad) setText(byId("mayday-words"), "");
+  maydayHad = Boolean(board.mayday?.[node]);
   const { evacuation, roll_call: call } = board;
   const section = byId("orders");
   const answer = (kind, body) => postJson(`/api/${kind}`, { ...body, node, by: me.name }).catch((error) => {
@@ -117,10 +124,16 @@ function showOrders(board) {
     element.addEventListener("click", action);
     return element;
   };
+  const asked = node && JSON.stringify([node, evacuation?.nodes.includes(node) && Boolean(evacuation.acknowledged[node]),
+    call && call.ended_unix_s === null && call.nodes.includes(node) && !call.answers[node] && call.started_unix_s]);
+  const delivered = Boolean(evacuation?.delivered[node] || evacuation?.acknowledged[node]);
+  if (node && evacuation?.nodes.includes(node) && !delivered) answer("evacuate", { action: "delivered" });
+  // What others answer changes nothing here: the button stays under the thumb.
+  if (asked === section.dataset.asked) return;
+  section.dataset.asked = asked;
   const lines = [];
   if (node && evacuation?.nodes.includes(node)) {
     const seen = evacuation.acknowledged[node];
-    if (!evacuation.delivered[node] && !seen) answer("evacuate", { action: "delivered" });
     lines.push(make("p", { class: "evacuation" }, t(seen ? "evacuate.seen" : "evacuate.now"),
       ...(seen ? [] : [button("evacuate.understood", () => answer("evacuate", { action: "acknowledged" }))])));
   }
@@ -539,17 +552,32 @@ function showCompass() {
 
 hold(byId("mayday"), () => {
   if (!me) return open("me");
-  return postJson("/api/mayday", { node: me.node, on: true, by: me.name }).then(
-    () => setText(byId("last"), t("mayday.sent")),
-    (error) => setText(byId("last"), t("mayday.failed", { error: error.message })));
+  setText(byId("mayday-words"), t("mayday.sending"));
+  return callMayday(me.node, me.name);
 });
+
+/** Called until the session has it: whoever calls may have no hand for a second time. */
+async function callMayday(node, by) {
+  clearTimeout(maydayTimer);
+  try {
+    await postJson("/api/mayday", { node, on: true, by });
+    lastPress = null; // Else its line takes this one's place.
+    setText(byId("last"), t("mayday.sent"));
+    setText(byId("mayday-words"), t("mayday.sent"));
+  } catch (error) {
+    setText(byId("mayday-words"), maydayHad ? t("mayday.sent") : t("mayday.failed", { error: error.message }));
+    if (error.again) maydayTimer = setTimeout(() => maydayHad || callMayday(node, by), MAYDAY_AGAIN_MS);
+  }
+}
 byId("marker-place").addEventListener("click", async () => {
   if (!me) return open("me");
   const sign = byId("marker-sign").value;
   try {
     await postJson("/api/marker", { action: "set", id: randomId(), sign, node: me.node, by: me.name });
+    lastPress = null;
     return setText(byId("last"), t("marker.done", { sign: t(`marker.${sign}`) }));
   } catch (error) {
+    lastPress = null;
     return setText(byId("last"), t("sent.failed", { error: error.message }));
   }
 });
@@ -597,6 +625,7 @@ languageSwitch(byId("language"), () => {
   showSettings();
   if (!lastPress) setText(byId("last"), t("press.counts"));
   banner.update(alarms);
+  delete byId("orders").dataset.asked;
   if (orders) showOrders(orders);
   showTeam();
 });
