@@ -195,3 +195,14 @@ def test_the_board_has_no_rows_of_a_session_before(visit: Any, stage: Stage) -> 
     stage.team.size = 4
     stage.begin_another_session()
     expect(rows).to_have_count(4)
+
+
+def test_what_went_wrong_is_told_for_a_minute_and_not_for_ever(visit: Any, stage: Stage) -> None:
+    page = visit(init="const real = setTimeout; window.setTimeout = (f, ms) => real(f, ms / 20);",
+        expect_gone=True)  # fmt: skip
+    wait_live(page)
+    page.route("**/api/rollcall", lambda route: route.abort())
+    page.locator("#show-board").click()
+    page.locator("#roll-start").click()
+    expect(page.locator("#notices")).to_contain_text("The board has not changed")
+    expect(page.locator("#notices")).to_be_empty(timeout=10_000)

@@ -1,5 +1,6 @@
 import { aged, isFresh, LINK_LOST_S, reachM } from "/static/js/age.js";
 import { guidance } from "/static/js/finding.js";
+import { stateWords } from "/static/js/people.js";
 import { replayWords } from "/static/js/status_line.js";
 import { Team } from "/static/js/team.js";
 import { equal, near, ok, test } from "./check.js";
@@ -14,6 +15,17 @@ test("what a person's news say grows older while nothing comes, and is a last pl
   equal([old.status, old.moving, old.health], ["stale", null, "unknown"]);
   equal(aged({ ...ben, status: "lost" }, 60).status, "lost");
   equal(aged({ ...ben, status: "unlocated" }, 60).status, "unlocated");
+});
+
+test("who is not heard is not of now, located or not", () => {
+  for (const status of ["unlocated", "ambiguous"]) {
+    const person = { ...ben, status };
+    ok(isFresh(person));
+    ok(!isFresh({ ...person, seen_s: 4 }), status);
+    const words = stateWords({ ...person, seen_s: 60 }, undefined, 0.6);
+    ok(words.includes("last news"), words);
+    ok(!words.includes("Moves"), words);
+  }
 });
 
 test("nobody who is heard can have gone on", () => {

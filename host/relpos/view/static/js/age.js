@@ -2,6 +2,7 @@
 
 /** Without a view of the session for so long the link is lost, whatever else arrives. */
 export const LINK_LOST_S = 3.5;
+const STALE_S = 3; // live/composer.py
 /** How fast somebody who is not heard may have gone on: an unhurried walk. */
 export const WALKING_M_S = 1.4;
 const BEAT_MS = 500;
@@ -19,9 +20,11 @@ export function sinceS({ wallMs, steadyMs }) {
   return Math.max(Date.now() - wallMs, performance.now() - steadyMs) / 1000;
 }
 
-/** Whether a person's values are of now. */
+/** Whether a person's values are of now: also somebody who is not located has to be heard. */
 export function isFresh(person) {
-  return person != null && person.status !== "stale" && person.status !== "lost";
+  if (person == null || person.status === "stale" || person.status === "lost") return false;
+  // The session calls only who is located stale.
+  return person.status === "ok" || !(person.seen_s > STALE_S);
 }
 
 /** How far from the last known place a person may be by now, in metres; 0 while heard, and for a node that nobody wears. */

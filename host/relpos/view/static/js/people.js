@@ -29,8 +29,8 @@ export function stateWords(person, alarm, here) {
   if (person.post) return isFresh(person) ? t("post.state") : t("state.stale", { ago: ago(person.seen_s) });
   const words = [];
   if (alarm?.kind === "lost" || person.status === "lost") words.push(t("state.lost", { ago: ago(person.seen_s) }));
-  else if (person.status === "stale") words.push(t("state.stale", { ago: ago(person.seen_s) }));
-  else if (person.status === "unlocated") words.push(t("state.unlocated"));
+  else if (!isFresh(person)) words.push(t("state.stale", { ago: ago(person.seen_s) }));
+  if (person.status === "unlocated") words.push(t("state.unlocated"));
   else if (person.status === "ambiguous") {
     words.push(here < 0.97 ? t("state.ambiguous-here", { probability: probability(here) }) : t("state.ambiguous"));
   }

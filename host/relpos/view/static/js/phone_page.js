@@ -26,6 +26,7 @@ import { alarmText, clock, compass, directionWords, distance, levelWords, nodeNa
 
 const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
+const TROUBLE_MS = 60_000;
 const MAYDAY_AGAIN_MS = 2000;
 
 const store = storage();
@@ -42,6 +43,7 @@ let sendTrouble = "";
 let listMs = -Infinity;
 let lastPress = null;
 let trouble = null;
+let troubleTimer = null;
 let orders = null;
 let maydayHad = false;
 let maydayTimer = null;
@@ -105,6 +107,17 @@ function handle(message, ageS) {
   }
 }
 
+/** Tell what went wrong here; after a while it is of the past. */
+function say(text) {
+  trouble = { level: "warning", text };
+  clearTimeout(troubleTimer);
+  troubleTimer = setTimeout(() => {
+    trouble = null;
+    showTeam();
+  }, TROUBLE_MS);
+  showTeam();
+}
+
 /** What the commander asks of me: to leave, to answer a roll call. */
 function showOrders(board) {
   orders = board;
@@ -115,10 +128,8 @@ function showOrders(board) {
   maydayHad = Boolean(board.mayday?.[node]);
   const { evacuation, roll_call: call } = board;
   const section = byId("orders");
-  const answer = (kind, body) => postJson(`/api/${kind}`, { ...body, node, by: me.name }).catch((error) => {
-    trouble = { level: "warning", text: t("sent.failed", { error: error.message }) };
-    showTeam();
-  });
+  const answer = (kind, body) => postJson(`/api/${kind}`, { ...body, node, by: me.name })
+    .catch((error) => say(t("sent.failed", { error: error.message })));
   const button = (key, action) => {
     const element = make("button", { type: "button", class: "main", "data-t": key });
     element.addEventListener("click", action);
@@ -177,7 +188,7 @@ function showTeam() {
   listMs = performance.now();
   showAge();
   showNotices(byId("notices"), [...(trouble ? [trouble] : []), ...team.notices.map((notice) => ({ ...notice, text: said(notice.said, notice.text) }))]);
-  setHidden(byId("team-empty"), team.pictures > 0);
+  setHidden(byId("team-empty"), team.order.length > 0);
   showMe();
   const list = team.list()
     .filter((person) => person.node !== me?.node)
@@ -249,7 +260,7 @@ function showMe() {
 }
 
 function showAge() {
-  const age = dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
+  const age = team.arrivedUnixS === null ? null : dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
   const status = team.replayed ? replayWords(connection.state, team.session, team.timeS)
     : connectionWords(connection.state, age, connection.retryS);
   showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, status);
@@ -263,7 +274,7 @@ async function acknowledge(nodes) {
   try {
     for (const node of nodes) await postJson("/api/acknowledge", { node, by });
   } catch (error) {
-    trouble = { level: "warning", text: t("acknowledge.failed", { error: error.message }) };
+    say(t("acknowledge.failed", { error: error.message }));
   }
 }
 

@@ -46,7 +46,6 @@ export class Team {
     this.viewedAt = null;
     this.seq = null;
     this.order = [];
-    this.pictures = 0;
   }
 
   /** Handle a message that is at most `ageS` old; returns its type, or "unknown" for one that this page cannot read. */
@@ -105,7 +104,6 @@ export class Team {
     this.age(0);
     this.pairs = new Map((picture.pairs ?? []).map((pair) => [pairKey(pair[0], pair[1]), pair]));
     this.order = [...this.people.keys()].sort((a, b) => a - b);
-    this.pictures += 1;
     for (const person of this.people.values()) {
       // Only located people leave a track.
       if (!person.post && (person.status === "ok" || person.status === "stale")) {

@@ -25,6 +25,7 @@ import { Timeline } from "./timeline.js";
 import { alarmText, duration, levelWords } from "./words.js";
 
 const LIST_MS = 200; // five times a second is enough for the eye
+const TROUBLE_MS = 60_000;
 const TABLE_MS = 1000; // screen readers read the table
 
 /** Who answers here, in the log and on the other pages. */
@@ -36,6 +37,7 @@ let listMs = 0;
 let listTimer = null;
 let tableMs = 0;
 let trouble = null;
+let troubleTimer = null;
 
 const siren = new Siren(showSound);
 const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamera });
@@ -53,18 +55,9 @@ const findView = new FindView(byId("find"), {
   next: (by) => find(neighbour(findView.to, by, findView.from)),
   swap: () => startFinding(findView.to, findView.from),
 });
-const board = new BoardView(team, { by, find, say: (text) => {
-  trouble = { level: "warning", text };
-  refresh(true);
-} });
-const ground = new Ground(map, team, { by, say: (text) => {
-  trouble = { level: "warning", text };
-  refresh(true);
-} });
-const timeline = new Timeline((text) => {
-  trouble = { level: "warning", text };
-  refresh(true);
-});
+const board = new BoardView(team, { by, find, say });
+const ground = new Ground(map, team, { by, say });
+const timeline = new Timeline(say);
 byId("smoothed").addEventListener("change", (event) => {
   map.layers.smoothed = event.target.checked;
   map.invalidate();
@@ -72,6 +65,17 @@ byId("smoothed").addEventListener("change", (event) => {
 const source = new SourceView();
 const keepFocus = followFocus(byId("map"));
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
+
+/** Tell what went wrong here; after a while it is of the past. */
+function say(text) {
+  trouble = { level: "warning", text };
+  clearTimeout(troubleTimer);
+  troubleTimer = setTimeout(() => {
+    trouble = null;
+    refresh(true);
+  }, TROUBLE_MS);
+  refresh(true);
+}
 
 // -- messages --------------------------------------------------------------------------------------
 
@@ -186,7 +190,7 @@ function refresh(now = false) {
 function show() {
   listMs = performance.now();
   showAge();
-  byId("waiting").hidden = team.pictures > 0;
+  byId("waiting").hidden = team.order.length > 0;
   const notices = [...team.notices];
   if (trouble) notices.unshift(trouble);
   if (connection.unreadable) {
@@ -227,7 +231,7 @@ function showTable() {
 }
 
 function age() {
-  return dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
+  return team.arrivedUnixS === null ? null : dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs: team.viewedAt && 0, nowMs: 1000 * team.lagS });
 }
 
 function showAge() {
@@ -342,8 +346,7 @@ async function acknowledge(nodes) {
   try {
     for (const node of nodes) await postJson("/api/acknowledge", { node, by: by() });
   } catch (error) {
-    trouble = { level: "warning", text: t("acknowledge.failed", { error: error.message }) };
-    refresh(true);
+    say(t("acknowledge.failed", { error: error.message }));
   }
 }
 
@@ -351,8 +354,7 @@ async function shelve(node, forS) {
   try {
     await postJson("/api/shelve", { node, seconds: forS, by: by() });
   } catch (error) {
-    trouble = { level: "warning", text: t("shelve.failed", { error: error.message }) };
-    refresh(true);
+    say(t("shelve.failed", { error: error.message }));
   }
 }
 
@@ -399,8 +401,7 @@ hold(byId("end"), async () => {
   try {
     await postJson("/api/end", { by: by() });
   } catch (error) {
-    trouble = { level: "warning", text: t("end.failed", { error: error.message }) };
-    refresh(true);
+    say(t("end.failed", { error: error.message }));
   }
 });
 byId("help").addEventListener("click", () => byId("help-dialog").showModal());
