@@ -68,11 +68,13 @@ def test_a_page_that_is_opened_while_the_session_stands_still_says_since_when(
     wait_live(page)
     stage.mute = True
     expect_lost(page)
+    page.wait_for_timeout(5000)
     page.reload()
-    # At once: not after it has been told as live for a while.
-    expect(page.locator("#age")).to_have_text(re.compile(r"data \d+.s old"), timeout=2000)
-    expect(page.locator("#link")).to_contain_text("No connection")
-    expect(page.locator("#count")).to_have_text("(0 of 6 heard)")
+    expect_lost(page)
+    # It did not begin when the page was opened.
+    found = re.search(r"for (\d+).s", page.locator("#link").inner_text())
+    assert found
+    assert int(found[1]) >= 8
 
 
 def test_a_slow_browser_misses_pictures_and_shows_none_late(visit: Any, stage: Stage) -> None:

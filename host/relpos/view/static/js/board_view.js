@@ -208,7 +208,7 @@ export function hold(button, action) {
   button.addEventListener("keydown", (event) => {
     if (event.key === "Enter" || event.key === " ") {
       event.preventDefault();
-      // A key that stays down is one hold: a second would end the MAYDAY that it has called.
+      // A key that stays down is one hold: a second would call the MAYDAY again that it has ended.
       if (!event.repeat) start();
     }
   });
