@@ -80,9 +80,7 @@ export class BoardView {
       this.rows.delete(node);
     }
     byId("evacuate-team").disabled = select.disabled = !teams.length;
-    const wearers = this.team.wearers();
-    for (const [node, row] of this.rows) row.element.hidden = !wearers.some((person) => person.node === node);
-    for (const person of wearers) {
+    for (const person of this.team.wearers()) {
       const row = this.rows.get(person.node) ?? this.make(person.node);
       const place = people[person.node] ?? {};
       setText(row.name, person.name);
