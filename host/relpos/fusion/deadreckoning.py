@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Floats
 from relpos.fusion.estimator import (
     Estimate,
     NodeEstimate,
@@ -29,8 +29,6 @@ from relpos.fusion.estimator_settings import DeadReckoningSettings
 from relpos.fusion.initial_poses import by_node
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(slots=True)

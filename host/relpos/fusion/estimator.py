@@ -15,16 +15,14 @@ from math import atan2, cos, hypot, inf, pi, sin, sqrt
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Floats
 from relpos.fusion.models.motion import WALK_S, WithinReport, is_long
 from relpos.fusion.models.odometry_faults import STILL_M_S
 from relpos.fusion.models.unseen_walk import AXIS_M2_S2, UnseenWalk
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement
-
-Floats = npt.NDArray[np.float64]
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage of a long task, and how many of how many parts of it are done.
@@ -441,7 +439,7 @@ def refuse_unranged(ranges_used: int, counters: Mapping[str, int]) -> None:
 
 def heights_apart(
     known: Mapping[int, Presence], pairs: Sequence[tuple[int, int]]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return by how much the second of each pair is higher (P,), m, and the variances (P,), m^2."""
     heights = [(known[a].vertical, known[b].vertical) for a, b in pairs]
     dz_m = np.array([b.z_m - a.z_m for a, b in heights])

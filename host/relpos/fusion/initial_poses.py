@@ -15,16 +15,13 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.estimator import NodeEstimate, NodeStatus, Presence, unlocated
 from relpos.fusion.modes import belief_of
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Prior, Range
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 POSE = 3
 """Numbers of a pose: x, y (m), heading (rad)."""
@@ -55,9 +52,7 @@ class PoseMixture:
         own = slice(POSE * index, POSE * (index + 1))
         return self.poses[:, index], self.covariances[:, own, own]
 
-    def part(
-        self, nodes: Sequence[int], which: Indices | npt.NDArray[np.bool_] | None = None
-    ) -> PoseMixture:
+    def part(self, nodes: Sequence[int], which: Indices | Bools | None = None) -> PoseMixture:
         """Return what the hypotheses ``which``, or all, say of some nodes (indices)."""
         some = slice(None) if which is None else which
         weights, columns = self.weights[some], pose_columns(nodes)

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     MAX_ALTERNATIVES,
@@ -21,9 +21,6 @@ from relpos.fusion.estimator import (
     Shape,
     ellipse_axes,
 )
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 ONE_PLACE_M = 0.7
 """Hypotheses that differ by less are one mode; the first tried, then wider ones."""
@@ -109,11 +106,11 @@ def best_mode(weights: Floats, poses: Floats, covariances: Floats) -> int:
     return int(leaders[int(np.argmax(near @ weights))])
 
 
-def _near(places: Floats, covariances: Floats, of: Indices) -> npt.NDArray[np.bool_]:
+def _near(places: Floats, covariances: Floats, of: Indices) -> Bools:
     """Tell which places (K, 2) are one with those of hypotheses ``of`` (L,): (L, K)."""
     off = places[of, None, :] - places[None, :, :]
     reach2 = np.maximum(ONE_PLACE_M**2, 2.0 * np.trace(covariances, axis1=1, axis2=2))
-    near: npt.NDArray[np.bool_] = (off * off).sum(axis=2) < reach2
+    near: Bools = (off * off).sum(axis=2) < reach2
     return near
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from relpos.fusion.arrays import Floats
 
 
 def normal_density(off: Floats, variance: Floats | float) -> Floats:
     """Return the densities of deviations ``off`` from the mean."""
-    density: Floats = np.exp(-0.5 * off**2 / variance) / np.sqrt(2.0 * np.pi * variance)
-    return density
+    return np.exp(-0.5 * off**2 / variance) / np.sqrt(2.0 * np.pi * variance)

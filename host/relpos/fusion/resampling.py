@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from relpos.fusion.arrays import Floats, Indices
 
 
 def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:

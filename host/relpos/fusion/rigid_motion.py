@@ -11,9 +11,8 @@ ranges concern, and is still one. Bank and large teams keep S apart from P.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from relpos.fusion.arrays import Floats
 
 RIGID = 3
 """Parameters of a rigid motion: east, north (m), turn (rad) about a point."""

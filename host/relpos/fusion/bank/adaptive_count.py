@@ -6,8 +6,8 @@ import math
 from collections import Counter
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import hypothesis_count, storage
 from relpos.fusion.bank.hypothesis_models import DECIDED_AFTER_S, RangeErrors
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
@@ -15,9 +15,6 @@ from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
 from relpos.fusion.models.motion_variances import ALONG, ALONG_M2_M, COMPONENTS
 from relpos.fusion.resampling import systematic
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 class AdaptiveCount:

@@ -12,15 +12,13 @@ them it is put back. Reference implementation: :mod:`reference.bank`.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, store
 from relpos.fusion.bank.storage import PER_NODE, POSE, Hypotheses, block_of, place, row_place
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.rigid_motion import RIGID, rigid_motion
-
-Floats = npt.NDArray[np.float64]
 
 LEAST_RAD = 0.03
 """From this deviation of the common rotation on it is taken out. A mean direction of so much is

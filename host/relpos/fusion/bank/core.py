@@ -6,8 +6,8 @@ import math
 from collections import Counter
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import (
     detection_update,
     heading_update,
@@ -30,9 +30,6 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.odometry_faults import JUMP_M, CusumDetector
 from relpos.fusion.models.ranging import Repeats, slant_height
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 OUTLIER_RANGES = 2.0
 """The prior share of outliers counts as so many ranges. Where a third of the ranges are reflected,

@@ -11,17 +11,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import Lanes, fill, greater, lesser, load, select, some, store
 from relpos.fusion.bank.range_update import predict_range, range_gain
 from relpos.fusion.bank.storage import POSE, Hypotheses, block_of, correct
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.detection import STEP_M
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 _POINTS = 11
 _ASIDE = 2.5
@@ -38,7 +35,7 @@ class Attempts(NamedTuple):
     first: Indices
     second: Indices
     dz_m: Floats
-    received: npt.NDArray[np.bool_]
+    received: Bools
     attempted: Floats
     """Probability that there was an attempt at all."""
 

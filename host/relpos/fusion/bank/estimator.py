@@ -16,8 +16,8 @@ from functools import partial
 from statistics import median
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.mirrored import open_nodes
@@ -61,9 +61,6 @@ from relpos.fusion.post import posts_of
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Heading, Height, Prior, Range, nodes_of
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 SET_OFF_M = 0.3
 """A node without a heading has set off when it is this far from where it stood."""
@@ -452,7 +449,7 @@ class Bank:
             rounds.append(Attempts(*rows, received, attempted))
         return rounds
 
-    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> Bools:
         return on_one_floor(*heights_apart(self._known, pairs))
 
     def _sense(self, step: Sensed) -> None:

@@ -6,9 +6,9 @@ import math
 from collections import Counter
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank.hypothesis_models import Models, RangeErrors
 from relpos.fusion.bank.lanes import LANES
@@ -18,9 +18,6 @@ from relpos.fusion.bank.variance_components import VarianceComponents
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.ranging import CommonIndex
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 
 class HypothesisArrays:

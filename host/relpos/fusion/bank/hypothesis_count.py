@@ -22,13 +22,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.compiled import compiled, inner
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 STEPS = (50, 10, 1)
 """The bank shrinks by one of these at a time."""

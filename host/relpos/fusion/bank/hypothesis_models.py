@@ -6,13 +6,10 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.resampling import systematic
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
@@ -109,8 +106,7 @@ class Models:
 
     def has(self, kind: RangeErrors) -> Floats:
         """1 where range errors are of this kind (K,), else 0."""
-        has: Floats = np.equal(self.range_errors, kind).astype(np.float64)
-        return has
+        return np.equal(self.range_errors, kind).astype(np.float64)
 
     @property
     def has_biases(self) -> Floats:
@@ -119,8 +115,7 @@ class Models:
 
     def share_of_kinds(self, weight: Floats) -> Floats:
         """Return the sum of the weights (K,) of each of :class:`RangeErrors`."""
-        share: Floats = np.bincount(self.range_errors, weight, len(RangeErrors)).astype(np.float64)
-        return share
+        return np.bincount(self.range_errors, weight, len(RangeErrors)).astype(np.float64)
 
     def select(self, chosen: Indices) -> Models:
         """Return those of the hypotheses ``chosen`` (M,)."""

@@ -6,8 +6,8 @@ import math
 from collections import Counter
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import common_rotation, lanes, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.hypothesis_arrays import HypothesisArrays
@@ -28,9 +28,6 @@ from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import CLOCK_SD_S
 from relpos.fusion.resampling import systematic
 from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 JITTER = 0.1
 """Standard deviation of the log components' jitter at resampling, in units of their spread."""

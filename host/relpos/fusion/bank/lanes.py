@@ -20,16 +20,14 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from relpos.fusion import vectormath
+from relpos.fusion.arrays import Floats
 from relpos.fusion.compiled import compiled, inner
-
-Floats = npt.NDArray[np.float64]
 
 LANES = 8
 """Doubles in a vector register of AVX-512, and in a line of the cache."""

@@ -12,16 +12,13 @@ import math
 from collections.abc import Container, Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Complexes, Floats, Indices
 from relpos.fusion.bank import storage
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.estimator import VAGUE_PAIR_M
 from relpos.fusion.models.handedness import ASIDE_M, BETWEEN_M
-
-Floats = npt.NDArray[np.float64]
-Complexes = npt.NDArray[np.complex128]
 
 VAGUE_RAD = math.radians(45.0)
 """A user whose heading relative to every peer's has a larger standard deviation is ambiguous."""
@@ -36,7 +33,7 @@ side, ``mission-split-hard``, seeds 740 to 747, and of what is ``ok`` there, wit
 99, 99, with 0.1 0.3 %; 96, 99, 98, with 0.02 0.1 %; 93, 93, 90."""
 
 
-def heading_sigmas(covariance: Floats, rows: npt.NDArray[np.int64]) -> Floats:
+def heading_sigmas(covariance: Floats, rows: Indices) -> Floats:
     """Return the standard deviation (N,) of each heading relative to the one it is best known to.
 
     ``covariance`` (D, D) is without the team's rotation.
@@ -49,9 +46,7 @@ def heading_sigmas(covariance: Floats, rows: npt.NDArray[np.int64]) -> Floats:
     return sigmas
 
 
-def open_sides(
-    places_m: Complexes, weight: Floats, near: npt.NDArray[np.bool_]
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def open_sides(places_m: Complexes, weight: Floats, near: Bools) -> tuple[Bools, Bools]:
     """Tell who (N,) of hypotheses (K, N) may be on either side of the line through two others.
 
     And who is in such a line, where sides cannot be told apart.

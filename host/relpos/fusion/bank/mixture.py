@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, fill, greater, load, store
 from relpos.fusion.bank.range_update import predict_range
 from relpos.fusion.bank.storage import POSE, Block, row_place
 from relpos.fusion.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PERTURBED_UPDATES = 5.0
 """For so many instants of ranges a perturbed hypothesis teaches nothing about noise."""

@@ -16,8 +16,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, Lanes, fill, greater, load, select, store
 from relpos.fusion.bank.storage import (
@@ -33,9 +33,6 @@ from relpos.fusion.bank.storage import (
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.motion_variances import COMPONENTS, WHITE, base_variances
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 DRIFT_WALK = 3e-9
 """Random walk of the drift, rad^2/s^2 per second of moving: 0.06 deg/s in five minutes. Without it

@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import lanes, storage
 from relpos.fusion.bank.hypothesis_arrays import HypothesisArrays
 from relpos.fusion.bank.hypothesis_models import (
@@ -30,9 +30,6 @@ from relpos.fusion.models.ranging import (
     CommonIndex,
     deviations_within,
 )
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 HEIGHT_DRAWN_M, HEIGHT_SD_M = 2.0, 2.0
 """A user's unknown height begins at one that is drawn with the first deviation, and has the second.
@@ -204,8 +201,7 @@ class RangeBiases:
         models = self._hypotheses.models
         heights = models.has(RangeErrors.HEIGHT)[which]
         own = self._hypotheses.settings.pair_bias_m**2
-        variance: Floats = models.has_biases[which] * (own + heights * (STOREY_M2**2 - own))
-        return variance
+        return models.has_biases[which] * (own + heights * (STOREY_M2**2 - own))
 
     # -- entries of ranges ---------------------------------------------------------------------
 

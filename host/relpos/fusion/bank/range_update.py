@@ -25,8 +25,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import Lanes, fill, greater, lesser, load, select, some, store
 from relpos.fusion.bank.storage import (
@@ -52,9 +52,6 @@ from relpos.fusion.models.ranging import (
     PASSING_SHARE,
     CommonIndex,
 )
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 STATS = 12
 MEAN, VARIANCE, EVIDENCE, INLIER, SHARES, RANGE_SHARE, CURVATURE = 0, 1, 2, 3, 4, 10, 11

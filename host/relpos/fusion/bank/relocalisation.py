@@ -11,8 +11,8 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mirrored import mirror_image
@@ -29,9 +29,6 @@ from relpos.fusion.models.odometry_faults import (
     perturb,
 )
 from relpos.fusion.rigid_motion import about_origin
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 OPEN_UPDATES = 60
 """Many hypotheses are kept for so many instants of ranges at most: what has not resolved a pose

@@ -14,8 +14,8 @@ from itertools import combinations
 from statistics import median
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.mirrored import VAGUE_RAD
@@ -39,8 +39,6 @@ from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, sought_n
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.ranging import RANGE_SCALE_SD, CommonIndex, deviations_within
 from relpos.fusion.modes import alternatives_of, belief_of
-
-Floats = npt.NDArray[np.float64]
 
 VAGUE_M = 2.0
 """A user whose distance to every peer has a larger standard deviation is ambiguous."""

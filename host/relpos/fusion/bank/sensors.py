@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.bank import mixture
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.range_update import INLIER, MEAN, VARIANCE, RangeModel, Ranges
@@ -20,9 +20,6 @@ from relpos.fusion.bank.storage import Hypotheses
 from relpos.fusion.bank.variance_components import Draws
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.odometry_faults import CusumDetector, update_cusum
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PERTURBED_WEIGHT = 1e-3
 """Weight of perturbed hypotheses in what was expected of a range: to them any is usual."""

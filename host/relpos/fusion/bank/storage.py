@@ -16,15 +16,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, Lanes, load, some, store
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.ranging import CommonIndex
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 IndicesOrInt = Indices | int
 
 

@@ -11,9 +11,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.fusion import vectormath
+from relpos.fusion.arrays import Floats
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, fill, load, store
 from relpos.fusion.bank.range_update import (
@@ -28,9 +28,6 @@ from relpos.fusion.bank.range_update import (
 from relpos.fusion.bank.storage import Hypotheses
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.motion_variances import COMPONENTS
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 PRIOR = np.array([0.0, 0.0, -1.0])
 TEAM_SD = np.array([0.6, 1.2, 1.5])

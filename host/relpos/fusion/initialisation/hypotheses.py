@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats
 from relpos.fusion.initial_poses import POSE, pose_columns
 from relpos.fusion.initialisation.kernels import PER_NODE, Fits, Problem, fit
-
-Floats = npt.NDArray[np.float64]
 
 _TWO_PI = 2.0 * np.pi
 
@@ -138,7 +136,7 @@ class Hypotheses:
             pose[:, 1] += sine * dx_m + cosine * dy_m
             pose[:, 2] += dtheta_rad
 
-    def agreeing(self, nodes: Sequence[int]) -> npt.NDArray[np.bool_]:
+    def agreeing(self, nodes: Sequence[int]) -> Bools:
         """Tell which hypotheses (M,) agree with the best one on where ``nodes`` are."""
         poses = self.poses
         off = poses[:, nodes] - poses[0, nodes]
@@ -148,10 +146,10 @@ class Hypotheses:
         flat = off.reshape(len(poses), -1)
         agree = (flat * np.linalg.solve(spread, flat.T).T).sum(axis=1) < 9.0 + 2.0 * flat.shape[1]
         agree |= (off[:, :, :2] ** 2).sum(axis=2).max(axis=1) < 0.5
-        result: npt.NDArray[np.bool_] = agree
+        result: Bools = agree
         return result
 
-    def select(self, which: npt.NDArray[np.bool_], nodes: Sequence[int]) -> None:
+    def select(self, which: Bools, nodes: Sequence[int]) -> None:
         """Keep some hypotheses (M,) and some nodes."""
         blocks, bias = self.by_node[which][:, nodes], self.fits.parameters[which, -1:]
         columns = pose_columns(nodes)
@@ -167,8 +165,7 @@ class Hypotheses:
 
 def log_evidence(fits: Fits) -> Floats:
     """Return the log evidence (M,) of the neighbourhoods of fits (Laplace)."""
-    evidence: Floats = -0.5 * fits.costs + fits.log_volumes
-    return evidence
+    return -0.5 * fits.costs + fits.log_volumes
 
 
 def fitted(parameters: Floats, iterations: int, problem: Problem) -> Fits:

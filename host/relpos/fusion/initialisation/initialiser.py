@@ -14,14 +14,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.initial_poses import PoseMixture
 from relpos.fusion.initialisation.search import MOVED_M, HypothesisSearch
 from relpos.fusion.timeline import Advance
 from relpos.measurements import WIDEST_START_M, WIDEST_START_RAD, Prior, Range
-
-Floats = npt.NDArray[np.float64]
 
 MOST_SOUGHT, MOST_SOUGHT_LARGE_TEAM = 8, 12
 """So many are sought together; the others wait: the search grows with the cube of their number.

@@ -22,14 +22,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.initial_poses import POSE
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
-Bools = npt.NDArray[np.bool_]
 
 PER_NODE = 4
 """Parameters of a node before its turns: x, y, heading, log scale."""

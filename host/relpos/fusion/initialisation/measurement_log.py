@@ -15,14 +15,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.initial_poses import POSE
 from relpos.fusion.initialisation.kernels import Priors, Problem, Ranges, Tracks
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
-
-Floats = npt.NDArray[np.float64]
 
 RANGE_SIGMA_M = 0.25
 """The range's own error, the rest of the pair's bias, and a margin for errors that repeat from

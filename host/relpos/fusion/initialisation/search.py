@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, POSE, PoseMixture
 from relpos.fusion.initialisation.hypotheses import Hypotheses, fitted, log_evidence
 from relpos.fusion.initialisation.kernels import Problem
@@ -28,8 +28,6 @@ from relpos.fusion.initialisation.measurement_log import RANGE_SIGMA_M, Measurem
 from relpos.fusion.initialisation.proposals import Proposals
 from relpos.fusion.modes import belief_of, best_mode, relative_poses
 from relpos.fusion.timeline import Advance
-
-Floats = npt.NDArray[np.float64]
 
 HYPOTHESES = 96
 """At most so many are kept; twice as many are placed at first."""
@@ -157,8 +155,7 @@ class HypothesisSearch:
     def _draw(self, count: int) -> Floats:
         """Draw the parameters of hypotheses by their weights."""
         drawn = self._rng.choice(len(self._hypotheses), size=count, p=self._hypotheses.weights)
-        parameters: Floats = self._hypotheses.fits.parameters[drawn]
-        return parameters
+        return self._hypotheses.fits.parameters[drawn]
 
     def _proposals(self, problem: Problem) -> Proposals:
         nodes = self.nodes

@@ -24,12 +24,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, StripLayout
-
-Floats = npt.NDArray[np.float64]
 
 
 def update(layout: StripLayout, covariance: Floats, information: Floats, push: Floats) -> Floats:

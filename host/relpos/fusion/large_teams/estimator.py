@@ -15,8 +15,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
@@ -60,9 +60,6 @@ from relpos.fusion.post import posts_of
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Height, Prior, Range, nodes_of
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 SIGMA_R_M = 0.3
 """Range sigma to begin with; a few instants of many ranges determine the true one."""
@@ -374,7 +371,7 @@ class LargeTeam:
             distance_m, along_m2, *_ = self.filter.pairs(*rows)
             self._detection.update(done, distance_m, np.sqrt(along_m2))
 
-    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> Bools:
         return on_one_floor(*heights_apart(self._known, pairs))
 
     def _collect(self, time_s: float, ranges: Sequence[Range]) -> None:

@@ -6,16 +6,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, Blocks, StripLayout
 from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE
 from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 NEAREST_M = 1e-3
 """Below this distance a direction means nothing; it keeps divisions finite."""

@@ -10,10 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from relpos.fusion.arrays import Floats, Indices
 
 COVARIANCE, INFORMATION = 5, 2
 """States of a node in the blocks: a covariance has all, information positions alone."""

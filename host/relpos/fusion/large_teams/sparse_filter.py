@@ -23,9 +23,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.large_teams import chain, kernels
 from relpos.fusion.large_teams.kernels import RangeModel, Ranges
@@ -33,8 +33,6 @@ from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
 from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex, deviations_within
 from relpos.fusion.rigid_motion import RIGID, about_origin, rigid_motion
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 IndicesOrInt = Indices | int
 
 JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
@@ -82,8 +80,7 @@ def prior_information(bias_sd_m: float) -> Floats:
     sigma[CommonIndex.SHADOW] = SHADOW_SD_M
     sigma[CommonIndex.LATENESS] = LATENESS_SD_S
     sigma[CommonIndex.GROWTH] = GROWTH_SD_M
-    information: Floats = np.diag(1.0 / (sigma**2 + JITTER_CONSTANT))
-    return information
+    return np.diag(1.0 / (sigma**2 + JITTER_CONSTANT))
 
 
 def own_term(row: IndicesOrInt, which: OwnTerm) -> IndicesOrInt:

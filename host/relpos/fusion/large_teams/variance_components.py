@@ -13,12 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.models.motion_variances import ALONG, COMPONENTS, TURN, WHITE
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 TEAM_GAIN = 0.3
 """How far the team's components follow the mean of an instant that many nodes contributed to."""

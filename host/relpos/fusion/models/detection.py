@@ -41,11 +41,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.compiled import compiled, inlined
 from relpos.measurements import Range
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Pair = tuple[int, int]
 
 STEP_M = 0.5
@@ -63,10 +62,9 @@ ONE_FLOOR_M = 1.75
 """Half a storey: whose heights differ by less, and surely so, are on one floor."""
 
 
-def on_one_floor(dz_m: Floats, variance_m2: Floats) -> npt.NDArray[np.bool_]:
+def on_one_floor(dz_m: Floats, variance_m2: Floats) -> Bools:
     """Return which pairs are on one floor, by their differences of height and those's variances."""
-    near: npt.NDArray[np.bool_] = np.abs(dz_m) + np.sqrt(variance_m2) < ONE_FLOOR_M
-    return near
+    return np.abs(dz_m) + np.sqrt(variance_m2) < ONE_FLOOR_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +99,7 @@ class Rounds:
         time_s: float,
         ranges: Sequence[Range],
         reported_s: Callable[[int], float],
-        level: Callable[[Sequence[Pair]], npt.NDArray[np.bool_]] | None = None,
+        level: Callable[[Sequence[Pair]], Bools] | None = None,
     ) -> list[Round]:
         """Return the rounds that end with these ranges of one instant: none, one or two.
 
@@ -125,7 +123,7 @@ class Rounds:
         self,
         time_s: float,
         reported_s: Callable[[int], float],
-        level: Callable[[Sequence[Pair]], npt.NDArray[np.bool_]] | None,
+        level: Callable[[Sequence[Pair]], Bools] | None,
     ) -> Round:
         received = self._open
         self.ever_received |= received
@@ -307,7 +305,7 @@ class _Family:
     log_received: npt.NDArray[np.float32]
     """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
     edge_m: Floats
-    fades: npt.NDArray[np.bool_]
+    fades: Bools
     """(F,) those of walls (``FADES_SOFTLY``, ``FADES_WITHIN_M``)."""
     fades_at_first: float
     """How probable these are while all curves are alike, summed as a posterior is."""

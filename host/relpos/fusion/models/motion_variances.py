@@ -10,11 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
 
 ALONG_M2_M = 0.004
 """7 % of half a metre at each half metre; people and sensors spread over 3 to 25 %."""

@@ -16,8 +16,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.estimator import ANY_ANGLE_RAD, MagneticNorth
 
 CORRELATED_S = 10.0
@@ -43,7 +43,7 @@ class North:
     sigma_rad: float = ANY_ANGLE_RAD
     _offset_rad: dict[tuple[int, str | None], float] = field(default_factory=dict)
     """Compass, by node and source -> what it errs by."""
-    _covariance: npt.NDArray[np.float64] = field(init=False)
+    _covariance: Floats = field(init=False)
     """Of the angle and these offsets, in this order (1 + C, 1 + C)."""
     _reported_s: dict[int, float] = field(default_factory=dict)
 

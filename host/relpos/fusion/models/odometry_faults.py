@@ -34,14 +34,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.compiled import compiled
 from relpos.fusion.models.motion import known_sigmas
 from relpos.fusion.timeline import Advance
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 JUMP_M = 3.0
 """How far a perturbed hypothesis is off. P1 with a start shifted by 4 m, seeds 23000 to 23007: .74
@@ -161,7 +158,7 @@ class Perturbations:
 
     poses: Floats
     covariances: Floats
-    kept: npt.NDArray[np.bool_]
+    kept: Bools
 
 
 def perturb(

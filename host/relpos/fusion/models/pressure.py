@@ -9,11 +9,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.measurements import Height
-
-Floats = npt.NDArray[np.float64]
 
 RATE_M_S, RATE_S = 2.5e-3, 3600.0
 """The weather's rate, a standard deviation: 1 hPa an hour; and how long it keeps."""

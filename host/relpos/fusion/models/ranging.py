@@ -17,10 +17,8 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+from relpos.fusion.arrays import Floats, Indices
 
 
 class CommonIndex(IntEnum):
@@ -67,8 +65,7 @@ def antenna_m(mountings: Mapping[int, Mounting], node: int) -> tuple[float, floa
 
 def slant_height(dz_m: Floats, variance_m2: Floats) -> Floats:
     """Return the root mean square of a difference of heights: what makes a range slant."""
-    slant: Floats = np.sqrt(dz_m * dz_m + variance_m2)
-    return slant
+    return np.sqrt(dz_m * dz_m + variance_m2)
 
 
 SIGMA_SLAB_M = 0.3
@@ -91,8 +88,7 @@ def deviations_within(covariance: Floats, entries: Indices) -> Floats:
     """
     own = np.eye(len(entries)) - 1.0 / max(len(entries), 1)
     spread = (own @ covariance[np.ix_(entries, entries)] @ own).diagonal()
-    deviations: Floats = np.sqrt(np.maximum(spread, 0.0))
-    return deviations
+    return np.sqrt(np.maximum(spread, 0.0))
 
 
 DELAY_SHARE = 0.5

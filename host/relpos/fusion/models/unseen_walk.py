@@ -13,11 +13,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.models.motion import WALK_M_S, WALK_S
-
-Floats = npt.NDArray[np.float64]
 
 AXIS_M2_S2 = 0.5 * WALK_M_S**2
 """Variance of the velocity along each axis, before anything is known."""

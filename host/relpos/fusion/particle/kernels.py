@@ -16,10 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion import vectormath
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.compiled import compiled
 
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 Integers = npt.NDArray[np.uint64]
 
 

@@ -26,13 +26,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.particle import kernels
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 OUTLIER_SPAN_M = 30.0
 """An outlier's density is flat over so much, so that one wrong range cannot outvote all others."""

@@ -12,14 +12,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.ranging import shadow_slope
 from relpos.measurements import Measurement, Range
-
-Floats = npt.NDArray[np.float64]
 
 SURE = 3.0
 """What is smaller than so many of its standard deviations is left in."""

@@ -15,12 +15,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Floats
 from relpos.fusion.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
 
 
 @compiled

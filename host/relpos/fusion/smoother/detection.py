@@ -10,13 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.models.detection import LENGTH, STEP_M, Detection
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import DetectionFactors, Problem
-
-Floats = npt.NDArray[np.float64]
 
 BLUR_M = 0.5
 """No edge is taken for sharper than the step of the tabulated curve."""

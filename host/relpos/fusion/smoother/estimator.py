@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
@@ -39,8 +39,6 @@ from relpos.fusion.smoother.solution import Solution, beginnings, smooth
 from relpos.fusion.smoother.variance_components import VarianceComponents
 from relpos.fusion.vertical.offline import as_climbed
 from relpos.measurements import Measurement, Prior
-
-Floats = npt.NDArray[np.float64]
 
 SURE_M = 1.0
 """A node that the online estimator left ambiguous, and that smoothing does not place within

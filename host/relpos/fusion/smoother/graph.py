@@ -14,18 +14,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.models.detection import Round, Rounds, on_one_floor
 from relpos.fusion.models.motion import known_sigmas, unseen_variance
 from relpos.fusion.models.ranging import Mounting, antenna_m, tag_height_m
 from relpos.fusion.smoother.as_learned import Rises
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 STILL_M = 0.02
 """A chord shorter than this is a standing node's noise: no path, no direction."""
@@ -56,16 +53,16 @@ class Chords(NamedTuple):
     turn_rad: Floats
     turn_share: Floats
     """(N,) share of its turn that a node's chord follows: 1 where it turns first, then walks."""
-    scale_at: Integers
+    scale_at: Indices
     """(K - 1,) where the chords' step scales begin among the constants, one of each node."""
 
 
 class Ranges(NamedTuple):
     """M distances between nodes, measured or attempted."""
 
-    chord: Integers
+    chord: Indices
     """(M,) the chords in which they lie."""
-    pair: Integers
+    pair: Indices
     """(M, 2) rows of nodes."""
     fraction: Floats
     """(M,) how far into the chord in time."""
@@ -76,7 +73,7 @@ class Ranges(NamedTuple):
     """(N, 2) forward, left."""
     dz_m: Floats
     """(M,) difference of heights."""
-    pair_index: Integers
+    pair_index: Indices
     """(M,) index of the pair's bias; -1 for a distance without biases."""
 
 
@@ -85,10 +82,10 @@ class Attempts:
     """Q attempts to range, one round after another; in a round the received come first."""
 
     rounds: tuple[Round, ...]
-    first: Integers
+    first: Indices
     """(rounds + 1,) where each round begins."""
     ranges: Ranges
-    missed: npt.NDArray[np.bool_]
+    missed: Bools
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ class Graph:
     chords: Chords
     usual_length_m: Floats
     """(K - 1, N) mean over the walked chords around each."""
-    walks: npt.NDArray[np.bool_]
+    walks: Bools
     """(K - 1, N) whether a chord is longer than ``STILL_M``."""
     sigma_m: Floats
     sigma_rad: Floats
@@ -112,12 +109,12 @@ class Graph:
     reports: Floats
     """(K - 1, N) in how many reports' parts a chord lies, in equal parts: 1 for a whole report, 2
     for two halves. The noise of consecutive chords is correlated where reports are parted."""
-    has_report: npt.NDArray[np.bool_]
+    has_report: Bools
     """(K - 1, N)"""
     ranges: Ranges
     range_m: Floats
     """(M,) as measured."""
-    pairs: Integers
+    pairs: Indices
     """(P, 2) rows of the pairs that ``ranges.pair_index`` counts."""
     attempts: Attempts
     prior: Floats
@@ -230,7 +227,7 @@ class _Builder:
         dz_m = math.hypot(reported_m, self.rises.rise_m(node, peer, time_s))
         return _Entry(len(self.times), time_s, node, peer, range_m, dz_m, tuple(places))
 
-    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> Bools:
         dz_m = np.array([self._height(a) - self._height(b) for a, b in pairs])
         return on_one_floor(dz_m, np.zeros(dz_m.size))
 
@@ -320,11 +317,11 @@ def _finished(builder: _Builder, priors: Sequence[Prior], start_s: float) -> Gra
     )
 
 
-def _scale_parts(time_s: Floats) -> Integers:
+def _scale_parts(time_s: Floats) -> Indices:
     """Return in which part of the run, 0 and up, every chord lies."""
     whole_s = time_s[-1] - time_s[0]
     parts = min(math.ceil(whole_s / SCALE_PART_S), MOST_SCALE_PARTS)
-    part: Integers = ((time_s[:-1] - time_s[0]) * (parts / whole_s)).astype(np.int64)
+    part: Indices = ((time_s[:-1] - time_s[0]) * (parts / whole_s)).astype(np.int64)
     return part
 
 
@@ -365,7 +362,7 @@ def _placed(
     return Ranges(slot, pair, fraction, offset, antenna_m, dz_m, np.full(slot.size, -1))
 
 
-def _unseen(duration_s: Floats, report_s: Floats, has_report: npt.NDArray[np.bool_]) -> Floats:
+def _unseen(duration_s: Floats, report_s: Floats, has_report: Bools) -> Floats:
     """Return ``Graph.unseen_m2`` for the longest report of each chord, (K - 1, N)."""
     usual_s = np.array(
         [np.median(own[has]) if has.any() else math.inf
@@ -376,7 +373,7 @@ def _unseen(duration_s: Floats, report_s: Floats, has_report: npt.NDArray[np.boo
     return np.where((report_s > GAP * usual_s) | ended, walked_m2[:, None], 0.0)
 
 
-def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_]) -> Floats:
+def _usual_length(length_m: Floats, walks: Bools) -> Floats:
     """Mean length of the walked chords around each, (K - 1, N); as reported for a standing one.
 
     A chord that happened to be reported too short is not more certain than its neighbours.

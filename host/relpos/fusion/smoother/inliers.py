@@ -10,16 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.models.ranging import AGAIN_M, ALIKE, OUTLIERS_SHORT
 from relpos.fusion.normal import normal_density
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import Inliers, Problem
 from relpos.fusion.smoother.variance_components import FAULT, VarianceComponents
-
-Floats = npt.NDArray[np.float64]
 
 SPAN_M = 10.0
 """An outlier may be anywhere within this."""

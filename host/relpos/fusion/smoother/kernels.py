@@ -9,15 +9,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.ranging import GROWTH_LEAST_M, growth_slope
 from relpos.fusion.smoother.block_solver import Covariance, Equations
 from relpos.fusion.smoother.graph import Chords, Ranges
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 _growth_slope = inner(growth_slope)
 
@@ -134,7 +131,7 @@ def add_component_columns(
     state: State,
     chords: Chords,
     force: Floats,
-    axis: Integers,
+    axis: Indices,
     columns: Floats,
     corner: Floats,
 ) -> None:
@@ -166,7 +163,7 @@ class _Slopes(NamedTuple):
 
     row: Floats
     """(12,) by the poses of node i before (x, y, h), i after, j before, j after."""
-    entry: Integers
+    entry: Indices
     constant: Floats
     """(3,) constants, and the derivatives by them: common bias, the pair's, growth."""
 
@@ -278,7 +275,7 @@ def add_range_columns(
     state: State,
     ranges: Ranges,
     weight: Floats,
-    added: tuple[Integers, Integers],
+    added: tuple[Indices, Indices],
     columns: Floats,
     corner: Floats,
 ) -> None:
@@ -374,7 +371,7 @@ def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Flo
 
 @compiled
 def two_states(
-    density: Floats, chain: Integers, share: float, go_on: float, probability: Floats
+    density: Floats, chain: Indices, share: float, go_on: float, probability: Floats
 ) -> tuple[float, float]:
     """Forward-backward passes of two-state Markov chains; fills ``probability`` (M,) of state 0.
 

@@ -18,16 +18,13 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats, Indices
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import Problem, Weights
 from relpos.fusion.smoother.solution import Solution, smooth
 from relpos.fusion.smoother.variance_components import motion_bases, weights_of
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 BLOCKS_S = (10.0, 20.0, 40.0)
 """What stands in between does so for so long; each also begins at half of it."""
@@ -61,7 +58,7 @@ def without_lasting_errors(problem: Problem, best: Solution) -> Solution:
 
 
 def excesses(
-    problem: Problem, state: State, weights: Weights, blocks: Sequence[Integers]
+    problem: Problem, state: State, weights: Weights, blocks: Sequence[Indices]
 ) -> Excesses:
     """Return what the excess of each block of ranges would be, if it had one."""
     equations = problem.normal_equations(state, weights)
@@ -87,7 +84,7 @@ def excesses(
     return Excesses(length_m, information)
 
 
-def _followed(problem: Problem, solution: Solution) -> npt.NDArray[np.bool_]:
+def _followed(problem: Problem, solution: Solution) -> Bools:
     """Return which ranges (M,) belong to blocks that would rather be too long."""
     state, components = solution.state, solution.components
     bases = motion_bases(problem, state, components)
@@ -104,7 +101,7 @@ def _followed(problem: Problem, solution: Solution) -> npt.NDArray[np.bool_]:
     return followed
 
 
-def _blocks(problem: Problem, solution: Solution) -> Iterator[Integers]:
+def _blocks(problem: Problem, solution: Solution) -> Iterator[Indices]:
     """Give the inliers of each pair within each of ``BLOCKS_S``, two or more."""
     graph, ranges = problem.graph, problem.graph.ranges
     time_s = graph.time_s[ranges.chord] + ranges.fraction * graph.chords.duration_s[ranges.chord]

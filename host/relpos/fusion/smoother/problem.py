@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.block_solver import Covariance, Equations
 from relpos.fusion.smoother.graph import Graph
 from relpos.fusion.smoother.kernels import State
-
-Floats = npt.NDArray[np.float64]
 
 
 class Weights(NamedTuple):

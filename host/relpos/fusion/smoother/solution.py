@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.smoother import detection
 from relpos.fusion.smoother.block_solver import Covariance
 from relpos.fusion.smoother.inliers import inlier_probabilities
@@ -22,8 +22,6 @@ from relpos.fusion.smoother.variance_components import (
     weights_of,
     widened,
 )
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass

@@ -13,8 +13,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import GO_ON, GO_ON_RANGES, GROWTH_SD_M
@@ -23,8 +23,6 @@ from relpos.fusion.smoother.block_solver import Covariance
 from relpos.fusion.smoother.graph import Graph
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import Inliers, Problem, Weights
-
-Floats = npt.NDArray[np.float64]
 
 
 class Motion(IntEnum):
@@ -388,7 +386,7 @@ def _distance_correlation(problem: Problem, at: Linearisation) -> Floats:
     apart = poses[chord + 1, i, :2] - poses[chord + 1, j, :2]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None]
 
-    def along(blocks: Floats, where: npt.NDArray[np.int64]) -> Floats:
+    def along(blocks: Floats, where: Indices) -> Floats:
         parts = blocks.reshape(-1, nodes, 3, nodes, 3)
         difference = parts[where, i, :2, i, :2] + parts[where, j, :2, j, :2]
         difference = difference - parts[where, i, :2, j, :2] - parts[where, j, :2, i, :2]

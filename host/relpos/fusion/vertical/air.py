@@ -10,12 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats
 from relpos.fusion.normal import normal_density
 from relpos.fusion.vertical.modes import FOLLOWS, Air
-
-Floats = npt.NDArray[np.float64]
 
 FAN_M_S = 0.25
 """Pressure of a fan, in metres a second: 25 Pa within 10 s are 0.21."""
@@ -32,7 +30,7 @@ class CommonRises(NamedTuple):
     """The common rises (R,)."""
     density: Floats
     """Of each node's height in each mode (N, MODES, R)."""
-    news: npt.NDArray[np.bool_]
+    news: Bools
     """Whether a node reported a height (N, 1)."""
 
     def of_each(self, modes: Floats) -> Floats:

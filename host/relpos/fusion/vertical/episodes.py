@@ -15,8 +15,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Floats
 from relpos.fusion.estimator import Episode
 from relpos.fusion.normal import normal_density
 from relpos.fusion.vertical.air import FAN_M_S, CommonRises, common_rises, of_others
@@ -36,8 +36,6 @@ from relpos.fusion.vertical.modes import (
     Mode,
     transition,
 )  # fmt: skip
-
-Floats = npt.NDArray[np.float64]
 
 _EPISODES: dict[Episode, tuple[Mode, ...]] = {
     Episode.LEVEL: (Mode.LEVEL,),
@@ -98,7 +96,7 @@ class Interval(NamedTuple):
     """The newest; NaN without news."""
     variance_m2: Floats
     """Of its noise."""
-    walked: npt.NDArray[np.bool_]
+    walked: Bools
     """Whether the node walked just before."""
 
 
@@ -125,9 +123,7 @@ def begin(height_m: Floats, variance_m2: Floats, airs: int = AIRS) -> Beliefs:
     return Beliefs(probability, height_m[:, None, None] * each, variance_m2[:, None, None] * each)
 
 
-def begin_again(
-    beliefs: Beliefs, some: npt.NDArray[np.bool_], height_m: Floats, variance_m2: Floats
-) -> Beliefs:
+def begin_again(beliefs: Beliefs, some: Bools, height_m: Floats, variance_m2: Floats) -> Beliefs:
     """Let some nodes (N,) stand level at their heights."""
     first = begin(height_m, variance_m2, beliefs.probability.shape[1])
     both = (np.where(some[:, None, None], a, b) for a, b in zip(first, beliefs, strict=True))

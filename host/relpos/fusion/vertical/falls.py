@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.vertical import episodes
 from relpos.fusion.vertical.episodes import Beliefs, Interval, Update
 from relpos.fusion.vertical.heights import UNSEEN_S
@@ -71,6 +72,6 @@ class FallDetector:
         self._begin(height_m, variance_m2)
         return True
 
-    def _begin(self, height_m: episodes.Floats, variance_m2: episodes.Floats) -> None:
+    def _begin(self, height_m: Floats, variance_m2: Floats) -> None:
         self._beliefs = episodes.begin(height_m, variance_m2, airs=1)
         self._recent.clear()

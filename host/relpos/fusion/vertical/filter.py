@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Bools, Complexes, Floats, Indices
 from relpos.fusion.estimator import Episode, Vertical
 from relpos.fusion.models.pressure import FAST_S
 from relpos.fusion.timeline import Advance
@@ -43,8 +43,6 @@ from relpos.fusion.vertical.modes import DOWN, FOLLOWS, PRESSURE, STAIRS, UP, Ai
 from relpos.fusion.vertical.stairs import true_shares
 from relpos.fusion.vertical.track import HEIGHT_LATE_S, Moved, Track
 from relpos.measurements import Height, Range
-
-Floats = npt.NDArray[np.float64]
 
 INTERVAL_S = 0.75
 """Shortest interval: of estimates ten times a second only some close one."""
@@ -110,11 +108,11 @@ class _Interval:
     update: Update
     rise_m: Floats
     way_m: Floats
-    moved: npt.NDArray[np.complex128]
+    moved: Complexes
     silent_s: Floats
-    again: npt.NDArray[np.bool_]
+    again: Bools
     """Whose height came after a while without."""
-    made: npt.NDArray[np.complex128]
+    made: Complexes
     """How the plane has been moved so far."""
     share: Floats = field(init=False)
     """Of the displacements that is true."""
@@ -180,16 +178,16 @@ class VerticalFilter:
     _level_s: Floats = field(default_factory=lambda: np.empty(0))
     """How long each has been level since it last changed its height."""
     _level_steps: Floats = field(default_factory=lambda: np.empty(0))
-    _base: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    _base: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """The floor that each was known to be on last; heights are over it."""
     _over: Over = field(default_factory=lambda: Over(np.empty(0), np.empty(0)))
     """Where pressure alone says that they are."""
     _doubt_m: Floats = field(default_factory=lambda: np.empty(0))
     """Standard deviation, signed, of what each climbed since: a rise that is the wearer's for one
     and the pressure's for another is taken from the other. What cancels was no climb."""
-    _walked: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    _walked: Bools = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     """In the last interval."""
-    _settled: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    _settled: Bools = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
     @property
     def active(self) -> bool:

@@ -12,12 +12,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats, Indices
 from relpos.fusion.normal import normal_density
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 LOWEST, HIGHEST = -8, 40
 """Floors that are considered."""

@@ -18,11 +18,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.models.pressure import FAST_M, FAST_S
-
-Floats = npt.NDArray[np.float64]
 
 Z, FAST, SLOW = 0, 1, 2
 """Entries of a node's state."""

@@ -11,9 +11,8 @@ from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from relpos.fusion.arrays import Floats
 
 
 class Mode(IntEnum):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from relpos.fusion.arrays import Floats
 from relpos.fusion.vertical.track import STEP_M
-
-Floats = npt.NDArray[np.float64]
 
 TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
 """A usual tread, and by how much it is shorter per metre of a higher riser. Builders keep
