@@ -26,6 +26,7 @@ from relpos import fusion
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.estimator_settings import BankSettings
+from relpos.fusion.models.ranging import Repeats
 from relpos.fusion.switching import SwitchingEstimator
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
@@ -41,6 +42,14 @@ def core_of(run: SimulatedRun, hypotheses: int) -> BankCore:
     return core
 
 
+def use_ranges(core: BankCore, first: np.ndarray, second: np.ndarray, range_m: np.ndarray) -> None:
+    """Update with ranges on one level, of users who stand."""
+    count = len(first)
+    nought, repeats = np.zeros(count), Repeats(np.ones(count), np.zeros(count))
+    no_velocity, no_outliers = np.zeros((count, 4)), np.zeros((count, 3))
+    core.update(first, second, range_m, nought, nought, repeats, no_velocity, no_outliers)
+
+
 def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
     """Microseconds of each epoch's parts (E,), NaN where there were others than so many."""
     motions = [m for m in run.measurements if isinstance(m, Motion)]
@@ -49,7 +58,7 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
     moves = np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions])
     first = np.array([m.node - 1 for m in ranges])
     second = np.array([m.peer - 1 for m in ranges])
-    range_m, dz_m = np.array([m.range_m for m in ranges]), np.zeros(len(ranges))
+    range_m, unreported = np.array([m.range_m for m in ranges]), np.full((len(moves), 3), np.nan)
     ends_s = np.arange(EPOCH_S, run.measurements[-1].time_s + EPOCH_S, EPOCH_S)
     move_ends = np.searchsorted([m.time_s for m in motions], ends_s, side="right")
     range_ends = np.searchsorted([m.time_s for m in ranges], ends_s, side="right")
@@ -61,12 +70,10 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
         moved, ranged = m, r
         ours = core.hypotheses.count == hypotheses
         marks = [time.thread_time()]
-        core.move(rows[some_moves], moves[some_moves])
+        core.move(rows[some_moves], moves[some_moves], unreported[some_moves])
         marks.append(time.thread_time())
         if len(first[some_ranges]):
-            core.update(
-                first[some_ranges], second[some_ranges], range_m[some_ranges], dz_m[some_ranges]
-            )
+            use_ranges(core, first[some_ranges], second[some_ranges], range_m[some_ranges])
         marks.append(time.thread_time())
         core.end_instant(end_s)
         marks.append(time.thread_time())

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos.evaluation.metrics import aligned_squared_distances
 from relpos.fusion.compiled import compiled
-from relpos.fusion.large_teams.kernels import RangeModel
+from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter
 
 Floats = npt.NDArray[np.float64]
@@ -66,7 +66,13 @@ class Strips:
 
     def update(self, node: Indices, peer: Indices, measured: Floats) -> None:
         """Work in the ranges."""
-        self.filter.update(node, peer, measured)
+        count, terms = len(node), len(self.filter.terms)
+        same, no_outliers, no_slopes = (
+            np.ones(count),
+            np.zeros((count, 3)),
+            np.zeros((count, terms)),
+        )
+        self.filter.update(Ranges(node, peer, measured, same, no_outliers, no_slopes))
 
     def pose(self) -> Floats:
         """Poses."""

@@ -36,8 +36,16 @@ class Joint:
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
+        from relpos.fusion.models.ranging import Repeats
+
+        count = ranges.node.size
         self.core.hypotheses.arrays.range_variance[:] = self.variance
-        self.core.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+        nought, repeats = np.zeros(count), Repeats(np.ones(count), np.zeros(count))
+        no_velocity, no_outliers = np.zeros((count, 4)), np.zeros((count, 3))
+        self.core.update(
+            ranges.node, ranges.peer, ranges.range_m, nought, nought, repeats, no_velocity,
+            no_outliers,
+        )  # fmt: skip
 
     def positions(self) -> Floats:
         """Means."""
@@ -102,7 +110,17 @@ class Strips:
 
     def update(self, ranges: Instant) -> None:
         """All ranges of the instant at once."""
-        self.filter.update(ranges.node, ranges.peer, ranges.range_m)
+        from relpos.fusion.large_teams.kernels import Ranges
+
+        count, terms = ranges.node.size, len(self.filter.terms)
+        same, no_outliers, no_slopes = (
+            np.ones(count),
+            np.zeros((count, 3)),
+            np.zeros((count, terms)),
+        )
+        self.filter.update(
+            Ranges(ranges.node, ranges.peer, ranges.range_m, same, no_outliers, no_slopes)
+        )
 
     def positions(self) -> Floats:
         """Means."""

@@ -22,6 +22,7 @@ from relpos.measurements import Heading, Height, Motion, Range, common_priors
 from relpos.runs import Description
 from relpos.runs.description import InitialPose
 from relpos.runs.run import assemble
+from support.plain_ranges import plain_ranges
 
 
 def one_spot(rng, node):
@@ -211,7 +212,7 @@ def walk_the_core(case, count, seed):
             first, second = np.array(some).T.copy()
             true_m = [math.dist(places[nodes[i]], places[nodes[j]]) for i, j in some]
             range_m = np.array([ranges(rng, m) for m in true_m])
-            core.update(first, second, range_m, np.zeros(len(some)))
+            core.update(*plain_ranges(first, second, range_m))
         if rng.random() < 0.1:
             core.update_heading(
                 rng.choice(rows.tolist()), rng.uniform(-4.0, 4.0), rng.choice([1e-6, 0.4])

@@ -194,7 +194,7 @@ def rehearse(room: str, seconds: int = _ALL_S) -> None:
         for node in places:
             initialiser.add(node)
         initialiser.update(
-            0.0, [Range(0.0, a, b, abs(places[b] - places[a])) for a, b in pairs], {}
+            0.0, [Range(0.0, a, b, abs(places[b] - places[a])) for a, b in pairs], {}, {}
         )
         initialiser.find(0.0)
         return

@@ -26,7 +26,6 @@ from relpos.measurements import Prior, Range
 POSE = 3
 """Numbers of a pose: x, y (m), heading (rad)."""
 
-
 HEADING_RESOLVED_RAD = 0.35
 """A heading below this standard deviation is known: joint filters are near enough to linear."""
 
@@ -111,7 +110,7 @@ class Initialiser(Protocol):
         time_s: float,
         ranges: Sequence[Range],
         located: Mapping[int, tuple[float, float, float]],
-        heights: Mapping[int, float] | None = None,
+        heights: Mapping[int, float],
     ) -> None:
         """Use the ranges of an instant, after the advances up to it.
 

@@ -16,6 +16,7 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.switching import SwitchingEstimator
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import simulate_paper
+from support.plain_ranges import plain_ranges
 
 
 def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) -> metrics.Metrics:
@@ -72,12 +73,13 @@ def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None
     for x_m in (0.0, 3.0):
         core.add_node((x_m, 0.0, 0.0), 0.1, 0.1)
     one, two = np.ones(1), np.ones(2)
+    fitting = plain_ranges(np.array([0]), np.array([1]), one)
     with pytest.raises(ValueError, match="shape"):
-        core.update(np.array([0]), np.array([1]), one, two)
+        core.update(*fitting[:3], two, *fitting[4:])
     with pytest.raises(IndexError, match="2 users"):
-        core.update(np.array([0]), np.array([2]), one, one)
+        core.update(*plain_ranges(np.array([0]), np.array([2]), one))
     with pytest.raises(IndexError, match="2 users"):
-        core.move(np.array([-1]), np.ones((1, 4)))
+        core.move(np.array([-1]), np.ones((1, 4)), np.ones((1, 3)))
 
 
 def test_a_state_that_is_no_longer_finite_is_an_error() -> None:

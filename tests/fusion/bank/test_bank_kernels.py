@@ -491,7 +491,9 @@ def test_bases_of_noise_are_the_reference_implementation() -> None:
     expected = small.base_variances(*moves.T, reported)
     assert base_variances(moves, reported) == pytest.approx(expected, rel=1e-12)
     without_reported = small.base_variances(*moves.T, np.full((40, 3), np.nan))
-    assert base_variances(moves, np.empty((0, 3))) == pytest.approx(without_reported, rel=1e-12)
+    assert base_variances(moves, np.full((40, 3), np.nan)) == pytest.approx(
+        without_reported, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("nodes", [1, 2, 7])

@@ -21,6 +21,7 @@ from relpos.fusion.models import detection
 from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, CommonIndex, Repeats
 from relpos.measurements import Measurement, Motion, Range
 from relpos.simulation.paper import simulate_paper
+from support.plain_ranges import plain_ranges
 
 NODES = 3
 
@@ -56,7 +57,9 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     slope[entry], slope[common] = slope[common], 0.0
     assert (slope[common:] != 0.0).sum() >= 4
     repeats = Repeats(np.ones(1), np.array([0.6]))
-    core.update(*pair, np.array([17.5]), np.zeros(1), None, repeats, velocity.reshape(1, 4))
+    nought = np.zeros(1), np.zeros(1)
+    speeds, no_outliers = velocity.reshape(1, 4), np.zeros((1, 3))
+    core.update(*pair, np.array([17.5]), *nought, repeats, speeds, no_outliers)
     after = these.dense()
     share = core._sensors.model.outlier
     for k in range(8):
@@ -95,7 +98,7 @@ def test_in_a_team_of_more_than_six_both_antenna_delays_are_in_a_range() -> None
     slope = reference.common_terms(x[0], p[0], nodes, 4, 2, np.zeros((2, 2)))
     slope[delays] = slope[common]
     sigma2 = these.arrays.range_variance.ravel()[:8].copy()
-    core.update(np.array([4]), np.array([2]), np.array([48.0]), np.zeros(1))
+    core.update(*plain_ranges(np.array([4]), np.array([2]), np.array([48.0])))
     after, share = these.dense(), core._sensors.model.outlier
     for k in range(8):
         outlier = float(share[0]), float(share[1]), OUTLIERS_SHORT

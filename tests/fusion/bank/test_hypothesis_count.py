@@ -16,6 +16,7 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.switching import SwitchingEstimator
 from relpos.simulation.paper import simulate_paper
+from support.plain_ranges import plain_ranges
 
 GOOD = {"heading_noise_deg": 0.3, "turn_noise": 0.0, "distance_noise_scale": 0.16}
 """Turn noise 0.3 deg a second, 2 % of the way; ranges of 0.1 m in ``paper-p1``."""
@@ -129,7 +130,7 @@ def _epochs(core: BankCore, first: int, count: int) -> None:
             np.tile([0.5, 0.0, turned, 1.0], (3, 1)),
             np.tile([0.02, 0.02, 0.005], (3, 1)),
         )
-        core.update(*pair, distance + noise_m[k], np.zeros(3))
+        core.update(*plain_ranges(*pair, distance + noise_m[k]))
         core.end_instant(float(k))
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.estimator_settings import BankSettings
+from support.plain_ranges import plain_ranges
 
 SIGMA_M = 0.1
 """Of the ranges; a bank begins with 0.3."""
@@ -35,7 +36,7 @@ def test_all_ranges_of_an_instant_together_teach_what_their_noise_is(users: int)
         first, second = np.array(list(combinations(range(users), 2))).T.copy()
         distances = np.linalg.norm(places[first] - places[second], axis=1)
         noise = SIGMA_M * np.random.default_rng(seed).standard_normal(len(first))
-        core.update(first, second, distances + noise, np.zeros(len(first)))
+        core.update(*plain_ranges(first, second, distances + noise))
         learned.append(0.5 * math.log(core.range_variance_m2 / SIGMA_M**2))
     # Of few ranges the 0.3 m that a bank begins with is left in it.
     assert -0.2 < np.mean(learned) < 0.45
@@ -48,9 +49,9 @@ def test_ranges_teach_the_same_in_one_instant_as_in_many() -> None:
     together, places = ring(users)
     single, _ = ring(users)
     range_m = np.linalg.norm(places[first] - places[second], axis=1) + noise
-    together.update(first, second, range_m, np.zeros(len(first)))
+    together.update(*plain_ranges(first, second, range_m))
     for k in range(len(first)):
         one = slice(k, k + 1)
-        single.update(first[one], second[one], range_m[one], np.zeros(1))
+        single.update(*plain_ranges(first[one], second[one], range_m[one]))
     ratio = math.sqrt(together.range_variance_m2 / single.range_variance_m2)
     assert 0.75 < ratio < 1.33

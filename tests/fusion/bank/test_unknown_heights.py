@@ -17,6 +17,7 @@ from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.ranging import CommonIndex
 from relpos.measurements import Measurement, Range
+from support.plain_ranges import plain_ranges
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def test_a_pairs_height_is_learned_from_its_ranges_alone(true_m: float) -> None:
         core.add_node((x_m, 0.0, 0.0), 0.05, 0.05)
     pair = np.array([0]), np.array([1])
     for _ in range(8):
-        core.update(*pair, np.array([np.hypot(6.0, true_m)]), np.zeros(1))
+        core.update(*plain_ranges(*pair, np.array([np.hypot(6.0, true_m)])))
     these = core.hypotheses
     entry, x = these.biases.pairs[0, 1], these.dense()[0]
     own = these.models.range_errors == RangeErrors.HEIGHT
@@ -161,7 +162,7 @@ def test_a_range_between_unknown_heights_corrects_as_a_million_samples_do() -> N
     both = np.cov(np.column_stack([drawn, ranges]).T)
     gain = both[:-1, -1] / (both[-1, -1] + variance)
     measured_m = ranges.mean() + 0.5
-    core.update(np.array([1]), np.array([0]), np.array([measured_m]), np.zeros(1))
+    core.update(*plain_ranges(np.array([1]), np.array([0]), np.array([measured_m])))
     after_x, after_p = these.dense()
     assert after_x[k, of] - x[k, of] == pytest.approx(0.5 * gain, rel=0.05)
     shrunk = both[:-1, :-1] - np.outer(gain, both[:-1, -1])
@@ -183,7 +184,7 @@ def test_hypotheses_agree_on_who_is_above_before_they_are_merged_and_go_on_alike
         core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
     first, second = np.triu_indices(7, 1)
     range_m = np.hypot(3.0 * (second - first), 4.0 * (second**2 - first**2))
-    core.update(first, second, range_m + 0.1, np.zeros(len(range_m)))
+    core.update(*plain_ranges(first, second, range_m + 0.1))
     plain = deepcopy(core)
     these = core.hypotheses
     own = these.models.range_errors == RangeErrors.HEIGHT
@@ -197,7 +198,7 @@ def test_hypotheses_agree_on_who_is_above_before_they_are_merged_and_go_on_alike
     these.biases.mirror_heights()
     assert (heights() @ heights()[best] > 0.0).all()
     for one in (core, plain):
-        one.update(first, second, range_m - 0.1, np.zeros(len(range_m)))
+        one.update(*plain_ranges(first, second, range_m - 0.1))
     (x, p), (plain_x, plain_p) = these.dense(), plain.hypotheses.dense()
     poses = slice(0, PER_NODE * 7)
     assert x[:, poses] == pytest.approx(plain_x[:, poses])

@@ -358,7 +358,7 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
                 case Motion(time_s, node, dx, dy, turn):
                     one.advance(Advance(time_s, node, 1.0, dx, dy, turn))
                 case Range():
-                    one.log.update(measurement.time_s, [measurement], {})
+                    one.log.update(measurement.time_s, [measurement], {}, {})
                     one.solve()
 
     for m in walk.measurements:

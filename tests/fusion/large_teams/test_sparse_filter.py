@@ -55,6 +55,15 @@ def started(
     return made, *dense_start(pose, [*variance, *np.square(DRIFT_AND_SCALE)])
 
 
+def plain(
+    made: NeighbourhoodFilter, node: np.ndarray, peer: np.ndarray, measured_m: Floats
+) -> Ranges:
+    """Ranges that are alike, and depend on no terms."""
+    count = len(node)
+    no_slopes = np.zeros((count, len(made.terms)))
+    return Ranges(node, peer, measured_m, np.ones(count), np.zeros((count, 3)), no_slopes)
+
+
 def random_moves(rng: np.random.Generator, count: int) -> Floats:
     moved = np.abs(rng.normal(0.3, 0.2, (count, 7)))
     moved[:, :3] = rng.normal(0.0, 0.5, (count, 3))
@@ -76,7 +85,7 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
         dense.wander(covariance, np.arange(9), moved_s)
         true = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
         measured = true + rng.normal(0.0, SIGMA_M, node.size)
-        made.update(node, peer, measured)
+        made.update(plain(made, node, peer, measured))
         dense.update(pose, covariance, node, peer, measured, SIGMA_M)
     assert np.abs(pose[:, 3:]).max() > 0.01
     # Ways are turned by the next motion, even if it is none.
@@ -113,7 +122,7 @@ def test_terms_delays_and_clocks_are_those_of_a_dense_filter_with_them_as_states
         true = np.hypot(*(state[node, :2] - state[peer, :2]).T)
         measured = true + rng.normal(0.0, SIGMA_M, node.size) + slopes[:, TERMS + 6] * 0.3
         sure, none = np.ones(node.size), np.zeros((node.size, 3))
-        made.update_with_terms(Ranges(node, peer, measured, sure, none, slopes))
+        made.update(Ranges(node, peer, measured, sure, none, slopes))
         dense.update_with_terms(state, terms, joint, (node, peer), measured, slopes, SIGMA_M)
     own, carried = dense.given_terms(joint, 7)
     assert np.allclose(made.state, state, atol=1e-4)
@@ -146,14 +155,14 @@ def test_a_team_that_outgrows_delays_and_clocks_keeps_what_all_ranges_have_in_co
     ones, none = np.ones(node.size), np.zeros((node.size, 3))
     common = rng.normal(0.0, 1.0, (node.size, TERMS))
     slopes = made.slopes_in_terms(node, peer, common, rng.normal(0.0, 1.0, node.size))
-    made.update_with_terms(Ranges(node, peer, measured, ones, none, slopes))
+    made.update(Ranges(node, peer, measured, ones, none, slopes))
     terms, sigma = made.terms[:TERMS], made.sigma_of_terms()[:TERMS]
     made.own_sd = ()
     made.add(pose[5:].copy(), variance[None])
     assert made.terms.tolist() == terms.tolist()
     assert made.sigma_of_terms() == pytest.approx(sigma)
     assert made.own_terms(OwnTerm.DELAY)[0].size == 0
-    made.update(node, peer, measured)
+    made.update(plain(made, node, peer, measured))
 
 
 def test_a_chain_of_strips_is_exact_where_the_ranges_form_one() -> None:
@@ -163,7 +172,7 @@ def test_a_chain_of_strips_is_exact_where_the_ranges_form_one() -> None:
     assert len(made._layout.sizes) >= 5
     node, peer = pairs_within(pose, 10.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T) + rng.normal(0, SIGMA_M, node.size)
-    made.update(node, peer, measured)
+    made.update(plain(made, node, peer, measured))
     dense.update(pose, covariance, node, peer, measured, SIGMA_M)
     assert np.allclose(made.state, pose, atol=1e-7)
     assert np.allclose(covariance_of(made), covariance, atol=1e-9)
@@ -175,7 +184,7 @@ def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
     made, pose, covariance = started(pose, width_m=11.0)
     node, peer = pairs_within(pose, 11.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
-    made.update(node, peer, measured)
+    made.update(plain(made, node, peer, measured))
     dense.update(pose, covariance, node, peer, measured, SIGMA_M)
     # Some nodes twice, some not at all: pieces of motion come as they come.
     who = np.array([0, 3, 3, 5, 7, 11, 0])
@@ -212,7 +221,7 @@ def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> N
     made, *_ = started(pose, width_m=10.0)
     node, peer = pairs_within(pose, 10.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
-    made.update(node, peer, measured)
+    made.update(plain(made, node, peer, measured))
     before = covariance_of(made)
     strip = made._layout.strip
     for direction, at in ((1, 1), (-1, 3), (1, 3)):
@@ -246,7 +255,7 @@ def play(crowd: Crowd) -> dict[str, float]:
         k = t // crowd.settings.range_period_s - 1
         at = slice(crowd.first[k], crowd.first[k + 1])
         node, peer, measured = crowd.node[at], crowd.peer[at], crowd.range_m[at]
-        made.update(node, peer, measured)
+        made.update(plain(made, node, peer, measured))
         truth = crowd.poses[t]
 
         def errors(of: Floats, a: Floats, b: Floats, truth: Floats = truth) -> Floats:
@@ -303,7 +312,7 @@ def test_far_pairs_come_from_the_chain_and_ranges_beyond_a_strip_are_taken() -> 
     # 35 m reach over three strips: the strips have to give way, the range has to count.
     true = float(np.hypot(*(pose[0, :2] - pose[3, :2])))
     before = made.pairs(np.array([0]), np.array([3]))[1, 0]
-    made.update(np.array([0]), np.array([3]), np.array([true]))
+    made.update(plain(made, np.array([0]), np.array([3]), np.array([true])))
     assert made.pairs(np.array([0]), np.array([3]))[1, 0] < 0.2 * before
     assert made.counters["strips_widened"] == 1
 
@@ -328,7 +337,7 @@ def test_the_teams_common_motion_is_kept_apart_and_told(width_m: float, left_sha
     made, *_ = started(pose, width_m)
     node, peer = pairs_within(pose, 10.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
-    made.update(node, peer, measured)
+    made.update(plain(made, node, peer, measured))
     made.predict(np.arange(30), random_moves(rng, 30))
     before, marginals, between = covariance_of(made), made.marginals(), made.pairs(node, peer)
     made.take_out_common_motion()

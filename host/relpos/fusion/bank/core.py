@@ -36,8 +36,6 @@ OUTLIER_RANGES = 2.0
 that has to be learned before they have moved a user (``lab``, seeds 300 to 323: 1.07 m with 5 %
 counting as four, 0.95 m with 10 % as two)."""
 
-_NOT_REPORTED: Floats = np.empty((0, 3))
-
 
 class BankCore:
     """Joint filters over N users (rows in the order of ``add_node``), for K hypotheses.
@@ -107,18 +105,17 @@ class BankCore:
 
     # -- one epoch -----------------------------------------------------------------------------
 
-    def move(self, rows: Indices, moves: Floats, sigmas: Floats | None = None) -> None:
+    def move(self, rows: Indices, moves: Floats, reported: Floats) -> None:
         """Move users ``rows`` (M,) in this order; a user may occur several times.
 
-        ``moves`` (M, 4) are dx, dy (m), dtheta (rad), duration (s); ``sigmas`` (M, 3) the
+        ``moves`` (M, 4) are dx, dy (m), dtheta (rad), duration (s); ``reported`` (M, 3) the
         reported standard deviations (forward and left m, turn rad), NaN where there are none.
         """
         several, these = len(rows), self.hypotheses
         if not several:
             return
-        reported = _NOT_REPORTED if sigmas is None else sigmas
         self._check(rows, rows)
-        if moves.shape != (several, 4) or len(reported) not in (0, several):
+        if moves.shape != (several, 4) or reported.shape != (several, 3):
             raise ValueError(f"displacements of shape {moves.shape} for {several} rows")
         motion, misjudged = motion_update.prepare_motion(
             rows, moves, reported, these.arrays.component, these.count, self._since_turn_s
@@ -147,35 +144,29 @@ class BankCore:
         second: Indices,
         range_m: Floats,
         dz_m: Floats,
-        dz_variance_m2: Floats | None = None,
-        repeats: Repeats | None = None,
-        velocity_m_s: Floats | None = None,
-        outliers: Floats | None = None,
+        dz_variance_m2: Floats,
+        repeats: Repeats,
+        velocity_m_s: Floats,
+        outliers: Floats,
     ) -> tuple[Floats, Floats]:
         """Update with the ranges (R,) of one instant; return what of each is an outlier.
 
         That is its inlier probability (R,), and by how much it is off if it is none (m).
 
-        ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
-        by default), ``repeats`` what of the pairs' last errors they repeat (nothing by default),
-        ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0),
-        ``outliers`` (R, 3) the least probability of being an outlier, the part of it that repeats
-        the pair's last one, and by how much that was off (m; 0).
+        ``dz_m`` are the antennas' differences of height, ``repeats`` what of the pairs' last errors
+        they repeat, ``outliers`` the least of :attr:`Ranges.outliers`.
         """
         several, these = len(first), self.hypotheses
-        variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
-        counts, kept = repeats or Repeats(np.ones(several), np.zeros(several))
-        self._check(first, second, range_m, dz_m, variance, counts)
+        self._check(first, second, range_m, dz_m, dz_variance_m2, repeats.sample_count)
         these.biases.watch(first, second, range_m)
         biases = these.biases.entries(first, second)
-        velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
         outlier, known = self._sensors.model.outlier, self._sensors
-        usual = np.full(several, sensors.expect_outliers(known.outlier_counts, outlier))
-        shares = np.zeros((several, 3)) if outliers is None else outliers.copy()
+        shares = outliers.copy()
+        usual = sensors.expect_outliers(known.outlier_counts, outlier)
         shares[:, 0] = np.maximum(usual, shares[:, 0])
-        slant_m = slant_height(dz_m, variance)
+        slant_m = slant_height(dz_m, dz_variance_m2)
         ranges = Ranges(
-            first, second, range_m, slant_m, variance, counts, kept, biases, velocity, shares
+            first, second, range_m, slant_m, dz_variance_m2, *repeats, biases, velocity_m_s, shares
         )
         outlier[2] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0

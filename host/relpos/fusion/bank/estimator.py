@@ -33,12 +33,7 @@ from relpos.fusion.estimator import (
     refuse_unranged,
 )
 from relpos.fusion.estimator_settings import BankSettings
-from relpos.fusion.initial_poses import (
-    HEADING_RESOLVED_RAD,
-    Initialiser,
-    PoseMixture,
-    by_node,
-)
+from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, Initialiser, PoseMixture, by_node
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
 from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
@@ -187,9 +182,7 @@ class Bank:
         self._pending = []
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
-        reported = None
-        if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
-            reported = np.array([reported_sigmas(a) for a in steps])
+        reported = np.array([reported_sigmas(a) for a in steps])
         begin = 0
         knowns, zero_motion, speed_gate = self._known, self.zero_motion, self.speed_gate
         self._moved = True
@@ -210,8 +203,8 @@ class Bank:
                 self._walk_unseen(node, time_s)
             else:
                 moves[k, :2] *= known.undiffused(time_s, duration_s)
-            vague = None if reported is None else vagueness(a)
-            if reported is not None and vague is not None:
+            vague = vagueness(a)
+            if vague is not None:
                 reported[k] = math.nan
                 self.core.relocalisation.inflate_covariance(int(rows[k]), *vague)
             if zero_motion.update(a):
@@ -220,22 +213,18 @@ class Bank:
                 known.velocity_m_s = (0.0, 0.0)
                 continue
             if speed_gate.exceeded(a):
-                self._make(rows, moves, reported, slice(begin, k))
-                self._move_doubtful(rows, moves, reported, k)
+                self.core.move(rows[begin:k], moves[begin:k], reported[begin:k])
                 begin = k + 1
-        self._make(rows, moves, reported, slice(begin, len(steps)))
+                self._move_doubtful(rows[k:begin], moves[k:begin], reported[k:begin])
+        self.core.move(rows[begin:], moves[begin:], reported[begin:])
 
-    def _move_doubtful(self, rows: Indices, moves: Floats, reported: Floats | None, k: int) -> None:
-        """Make displacement ``k``, which is far out of its node's habit, in half the hypotheses."""
+    def _move_doubtful(self, rows: Indices, moves: Floats, reported: Floats) -> None:
+        """Make a displacement that is far out of its node's habit in half the hypotheses."""
         self.core.adaptive.grow()
-        row, these = int(rows[k]), self.core.hypotheses
+        row, these = int(rows[0]), self.core.hypotheses
         before, _ = these.poses_of(row)
-        self._make(rows, moves, reported, slice(k, k + 1))
+        self.core.move(rows, moves, reported)
         self.core.relocalisation.split_motion(row, these.poses_of(row)[0] - before)
-
-    def _make(self, rows: Indices, moves: Floats, reported: Floats | None, some: slice) -> None:
-        """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""
-        self.core.move(rows[some], moves[some], None if reported is None else reported[some])
 
     def _range(self, step: Ranging, timeline: Timeline) -> None:
         located, time_s = self._row, step.time_s

@@ -41,9 +41,7 @@ resampling makes the reported sd up to twice too small."""
 CROSS = 0.3
 """Variance across the way relative to along it; turns err apart from that.
 
-Where it is too small, headings take what people swerve. With 0.04, 0.3 and 1 of it: twelve teams of
-real walkers (``bench/recorded_teams.py``) NEES 1.31, 1.25, 1.19; five recordings of robots 0, 1,
-3 % farther off; ``paper-p1``, which has none, 0.189, 0.190, 0.192 m. docs/notebook/bank.md."""
+Where it is too small, headings take what people swerve (docs/notebook/bank.md)."""
 
 LEAST_TURN_RAD, TURN_STANDS_OUT = 0.05, 3.5
 """A change of heading is a turn beyond both: so much, and so many deviations of white noise."""
@@ -346,9 +344,8 @@ def prepare_motion(
 ) -> tuple[Floats, Floats]:
     """Return what ``advance`` takes of displacements (M, 4), (M, 7), and who misjudges their turns.
 
-    ``reported`` (M, 3), or (0, 3) where no report brings any, are the reported deviations. The
-    second result (M,) is the share of hypotheses that are to misjudge a turn, -1 where there is
-    none.
+    ``reported`` (M, 3) are the reported deviations, NaN where there are none. The second result
+    (M,) is the share of hypotheses that are to misjudge a turn, -1 where there is none.
 
     A turn's noise grows with the turn, of which only the report is known: one of a right
     angle that was reported as next to nothing would pass for exact. Only what sticks out of
@@ -375,7 +372,7 @@ def prepare_motion(
                 mean += component[k // LANES, row, WHITE, k % LANES]
         white = motion[m, 6] * mean / count
         turn = motion[m, 2] ** 2 > LEAST_TURN_RAD**2 + TURN_STANDS_OUT**2 * white
-        if turn and (reported.shape[0] == 0 or math.isnan(reported[m, 2])):
+        if turn and math.isnan(reported[m, 2]):
             misjudged[m] = MISJUDGED * min(since_turn_s[row] / STRAIGHT_S, 1.0) ** 2
             since_turn_s[row] = 0.0
         else:

@@ -68,7 +68,7 @@ class Report:
     """What of the time stamps has been put right, beside the state."""
     distances: tuple[Floats, Floats]
     """Means and deviations (P,) of the distances of every two located nodes, in order (m)."""
-    unsure: Collection[int] = ()
+    unsure: Collection[int]
     """Nodes whose heading is not known relative to any other's, or may be mirrored."""
 
     def estimate(self, north: MagneticNorth | None) -> Estimate:
@@ -219,9 +219,8 @@ class Report:
 
         def learned(index: CommonIndex) -> tuple[float, float]:
             entry = these.common_entry(index)
-            return float(self.mean[entry]), math.sqrt(
-                max(float(self.covariance[entry, entry]), 0.0)
-            )
+            variance = max(float(self.covariance[entry, entry]), 0.0)
+            return float(self.mean[entry]), math.sqrt(variance)
 
         shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
         growth = learned(CommonIndex.GROWTH)

@@ -119,7 +119,7 @@ class HypothesisInitialiser:
         time_s: float,
         ranges: Sequence[Range],
         located: Mapping[int, tuple[float, float, float]],
-        heights: Mapping[int, float] | None = None,
+        heights: Mapping[int, float],
     ) -> None:
         """Use the ranges of an instant, after the advances up to it."""
         self._has_frame |= bool(located)

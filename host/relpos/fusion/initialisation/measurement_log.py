@@ -218,7 +218,7 @@ class MeasurementLog:
         time_s: float,
         ranges: Sequence[Range],
         located: Mapping[int, tuple[float, float, float]],
-        heights: Mapping[int, float] | None = None,
+        heights: Mapping[int, float],
     ) -> None:
         """Log the ranges of an instant (:meth:`relpos.fusion.initial_poses.Initialiser.update`).
 
@@ -232,7 +232,7 @@ class MeasurementLog:
         ]  # fmt: skip
         if not useful:
             return
-        time, height_of = self._time_index(time_s), heights or {}
+        time = self._time_index(time_s)
         for r in useful:
             first, second = sorted((r.node, r.peer), key=lambda n: (n not in tracks, n))
             if second in tracks:
@@ -245,7 +245,7 @@ class MeasurementLog:
                     x, y, variance = located[node]
                     places[end] = x, y
                     extra_m2 += variance
-            height_m = height_of.get(first, 0.0) - height_of.get(second, 0.0)
+            height_m = heights.get(first, 0.0) - heights.get(second, 0.0)
             self._log_range(
                 _PairRanges(
                     time, first, second, places, (paths[0], paths[1]), [r.range_m],

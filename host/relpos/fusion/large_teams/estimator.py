@@ -34,7 +34,6 @@ from relpos.fusion.estimator import (
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges, displacements
-from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import (
     NeighbourhoodFilter,
     OwnTerm,
@@ -54,6 +53,7 @@ from relpos.fusion.models.ranging import (
     OutlierPersistence,
     RangeCorrelation,
     antenna_m,
+    common_slopes,
     tag_height_m,
 )
 from relpos.fusion.post import posts_of
@@ -71,7 +71,6 @@ SIGMA_R_MEMORY = 20_000.0
 OUTLIERS, OUTLIER_M = 0.01, 3.0
 """A large team's fraction of outliers is not learned: 0.05 and 5 m cost a crowd 0.002 m of
 0.12."""
-
 
 ONE_STRIP = 50
 """Up to so many nodes are in one strip, where nothing is assumed of far ones, at no more time.
@@ -391,7 +390,7 @@ class LargeTeam:
             apart_m = math.hypot(peer_x - x, peer_y - y)
             near_m = max(apart_m, NEAREST_M)
             sight = (peer_x - x) / near_m, (peer_y - y) / near_m
-            slopes = slopes_of(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
+            slopes = common_slopes(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
             within_m2 = sum(_within_m2(k, time_s) for k in ends)
             excess_m = horizontal_m - apart_m
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2 + within_m2))
@@ -403,10 +402,8 @@ class LargeTeam:
         """Use the ranges that were collected."""
         if not self._collected:
             return
-        time_s, pairs = (
-            self._collected_s,
-            [(c.measured.node, c.measured.peer) for c in self._collected],
-        )
+        time_s = self._collected_s
+        pairs = [(c.measured.node, c.measured.peer) for c in self._collected]
         node, peer = (np.array([self._row[n] for n in ends]) for ends in zip(*pairs, strict=True))
         common = np.array([c.slopes for c in self._collected])
         excess = np.array([c.excess_m for c in self._collected])
@@ -423,7 +420,7 @@ class LargeTeam:
         counts = self._correlation.repeats(pairs).sample_count / (1.0 + lifted / f.model.sigma_m**2)
         innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2)
         outliers = self._outliers.expected(time_s, pairs)
-        inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
+        inlier = f.update(Ranges(node, peer, horizontal, counts, outliers, slopes))
         self._correct_unseen(pairs, time_s, before[:, :2], prior)
         horizontal -= slopes @ f.terms
         self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])

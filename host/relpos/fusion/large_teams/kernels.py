@@ -23,7 +23,6 @@ LEVERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1))
 ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (4, 4))
 """States (x, y, heading, drift, scale) between which moving adds covariance."""
 
-
 ACROSS = 0.1
 """Variance of a displacement across its direction relative to that along it."""
 
@@ -211,11 +210,7 @@ class RangeModel(NamedTuple):
 
 @compiled
 def range_information(
-    layout: StripLayout,
-    pairs: Floats,
-    ranges: Ranges,
-    model: RangeModel,
-    carried: Floats,
+    layout: StripLayout, pairs: Floats, ranges: Ranges, model: RangeModel, carried: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the ranges of one instant as information about positions, at the present poses.
 
@@ -263,10 +258,8 @@ def range_information(
         line = lines[e]
         line[0], line[1], line[2], line[3] = weight, ux, uy, innovation
         for t in range(terms):
-            change_x, change_y = (
-                carried[j, 0, t] - carried[i, 0, t],
-                carried[j, 1, t] - carried[i, 1, t],
-            )
+            change_x = carried[j, 0, t] - carried[i, 0, t]
+            change_y = carried[j, 1, t] - carried[i, 1, t]
             line[4 + t] = ranges.slopes[e, t] + ux * change_x + uy * change_y
         # The range grows with the peer along u and with the node against it.
         for who, sign in ((i, -1.0), (j, 1.0)):

@@ -254,13 +254,6 @@ class NeighbourhoodFilter:
 
     # -- ranges --------------------------------------------------------------------------------
 
-    def update(self, node: Indices, peer: Indices, measured_m: Floats) -> Floats:
-        """Use the ranges (E,) of one instant; return their probabilities of being no outliers."""
-        same = np.ones(len(node))
-        slopes = np.zeros((len(node), len(self.terms)))
-        outliers = np.zeros((len(node), 3))
-        return self.update_with_terms(Ranges(node, peer, measured_m, same, outliers, slopes))
-
     def slopes_in_terms(
         self, node: Indices, peer: Indices, common: Floats, peer_m_s: Floats
     ) -> Floats:
@@ -278,13 +271,13 @@ class NeighbourhoodFilter:
                 slopes[ranges, own_term(end, OwnTerm.CLOCK)] = speed_m_s
         return slopes
 
-    def update_with_terms(self, ranges: Ranges) -> Floats:
-        """As :meth:`update`, ranges that depend on T terms (slopes (E, T)).
+    def update(self, ranges: Ranges) -> Floats:
+        """Use the ranges (E,) of one instant; return their probabilities of being no outliers.
 
-        They are estimated in a second stage (Friedland 1969), which is exact for constants: with V
-        the derivative of the states by them, an innovation depends on them by its slopes plus H V,
-        and V changes by the gain times that. What they are not known to adds nothing to the
-        covariance (:meth:`spread_of_terms`).
+        The T terms are estimated in a second stage (Friedland 1969), which is exact for constants:
+        with V the derivative of the states by them, an innovation depends on them by its slopes
+        plus H V, and V changes by the gain times that. What they are not known to adds nothing to
+        the covariance (:meth:`spread_of_terms`).
         """
         self._catch_up()
         node, peer = ranges.node, ranges.peer

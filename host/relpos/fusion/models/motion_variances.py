@@ -35,9 +35,8 @@ ALONG, TURN, WHITE = range(COMPONENTS)
 def base_variances(moves: Floats, reported: Floats) -> Floats:
     """Give the bases (M, 3) of displacements (M, 4): along (m^2), turn and white (rad^2).
 
-    ``moves`` are dx, dy (m), dtheta (rad) and duration (s). ``reported`` (M, 3), or (0, 3), are the
-    reports' own deviations (forward, left, turn), NaN where one brings none; they take the bases'
-    place.
+    ``moves`` are dx, dy (m), dtheta (rad) and duration (s). ``reported`` (M, 3) are deviations
+    (forward, left, turn) that reports bring, or NaN; they take the bases' place.
     """
     base = np.empty((moves.shape[0], COMPONENTS))
     for m in range(moves.shape[0]):
@@ -49,8 +48,6 @@ def base_variances(moves: Floats, reported: Floats) -> Floats:
         base[m, ALONG] = ALONG_M2_M * way
         base[m, TURN] = TURN_RAD2_RAD * size * fourth / slow
         base[m, WHITE] = WHITE_RAD2_S * moves[m, 3] if way > 0.0 or size != 0.0 else 0.0
-        if reported.shape[0] == 0:
-            continue
         if not math.isnan(reported[m, 0]):
             left = 0.0 if math.isnan(reported[m, 1]) else reported[m, 1] ** 2
             base[m, ALONG] = max(reported[m, 0] ** 2, left)

@@ -107,16 +107,12 @@ nothing at the usual distance. Medians outdoors (``uwb_errors_outdoor``): -0.03 
 0.07 at 8, 0.15 at 16, 0.27 at 32; in seven rooms 0.05 to 0.15 a factor e; recordings of robots 0.1
 and -0.05 to -0.2 m. Nearer than the least distance nothing was measured."""
 
-
 RANGE_SCALE_SD = 0.008
 """Standard deviation of the share of a distance by which ranges may be too long or too short.
 
 Walls every few metres add so much a metre. Steps of unknown length hide it, so that it is not
 estimated: distances are reported with it where ranges' biases pass, or are not known pair by pair
-(a considered parameter, Schmidt 1966). Ninety missions drawn at random have a mean NEES of 2.1
-without it, 1.7 so, 1.4 with .02, and with walls 8, 6 and 4 % beyond three sigmas; four real teams
-in sight 1.1, 1.0 and .84; ``mission-shadow``, seed 640, .88, .73 and .52, where .7 is the least
-that is wanted (docs/notebook/missions.md)."""
+(a considered parameter, Schmidt 1966; docs/notebook/missions.md)."""
 
 
 def growth_slope(distance_m: float) -> float:
@@ -142,7 +138,6 @@ it does: what walls add belongs to the rooms that two people are in. Offices, se
 TURN_M = 0.2
 """A radian of turning counts as so much path: antenna and body turn along."""
 
-
 OUTLIERS_SHORT = 0.1
 """Share of the outliers that are too short: a weak first path is detected late, hardly ever early.
 P1 with a start shifted by 4 m, seeds 23000 to 23007: .34 m with .02 and .1, .49 with .5."""
@@ -156,8 +151,10 @@ GO_ON, GO_ON_RANGES = 0.6, 3.0
 fixed 0.95 gives 0.36 m in ``mission-nlos`` (0.65 without any), but costs 8 % in ``paper``; learned,
 it is 0.45 m, and nothing there."""
 
+Vector = tuple[float, float]
 
-def shadow_slope(sight: tuple[float, float], heading_rad: float, peer_heading_rad: float) -> float:
+
+def shadow_slope(sight: Vector, heading_rad: float, peer_heading_rad: float) -> float:
     """Return a range's slope in the body's shadow: how far each end is behind the other's wearer.
 
     ``sight`` is the direction from the node to the peer. The bank's kernels have the same equation
@@ -166,6 +163,30 @@ def shadow_slope(sight: tuple[float, float], heading_rad: float, peer_heading_ra
     ahead = sight[0] * math.cos(heading_rad) + sight[1] * math.sin(heading_rad)
     peer_ahead = sight[0] * math.cos(peer_heading_rad) + sight[1] * math.sin(peer_heading_rad)
     return max(-ahead, 0.0) + max(peer_ahead, 0.0)
+
+
+def common_slopes(
+    sight: Vector,
+    distance_m: float,
+    headings_rad: Sequence[float],
+    velocities_m_s: Sequence[Vector],
+) -> tuple[float, ...]:
+    """Return a range's slopes in what ranges have in common, in the order of ``CommonIndex``.
+
+    Then the peer's velocity along the sight, by which clocks are multiplied. ``sight`` is the
+    direction from the node to the peer; the others are the node's and the peer's.
+    """
+    ends = zip(headings_rad, velocities_m_s, strict=True)
+    own, other = (_along(sight, heading, velocity) for heading, velocity in ends)
+    return 1.0, shadow_slope(sight, *headings_rad), own - other, growth_slope(distance_m), other
+
+
+def _along(sight: Vector, heading_rad: float, velocity_m_s: Vector) -> float:
+    """Return along ``sight`` the velocity (m/s) of a node, given forward and left."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    forward, left = velocity_m_s
+    ahead, aside = sight[0] * c + sight[1] * s, sight[1] * c - sight[0] * s
+    return ahead * forward + aside * left
 
 
 ALIKE, AGAIN_M = 0.7, 0.3
