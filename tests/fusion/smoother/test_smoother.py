@@ -19,6 +19,8 @@ from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics
 from relpos.fusion.estimator import Estimate, Estimator, NodeStatus, Parameter
 from relpos.fusion.models.ranging import RANGE_SCALE_SD
+from relpos.fusion.smoother import kernels
+from relpos.fusion.smoother.block_solver import Covariance, Equations
 from relpos.fusion.smoother.detection import learn_curve, update_factors
 from relpos.fusion.smoother.estimator import Smoother
 from relpos.fusion.smoother.graph import build_graph
@@ -151,12 +153,17 @@ def test_the_block_solution_is_the_dense_one() -> None:
     assert found == pytest.approx(np.linalg.solve(whole, gradient), rel=1e-6, abs=1e-9)
 
 
+def covariance_of(equations: Equations) -> Covariance:
+    knots, b, size = equations.border.shape
+    return equations.covariance_and_solution(np.zeros((knots, b, 0)), np.zeros((size, 0)))[0]
+
+
 def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
     problem, state, weights = _problem()
     equations = problem.normal_equations(state, weights)
     whole = reference.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
     inverse = np.linalg.inv(whole)
-    covariance = equations.covariance()
+    covariance = covariance_of(equations)
     knots, b = covariance.diagonal.shape[:2]
     for k in range(knots):
         at = slice(k * b, (k + 1) * b)
@@ -174,9 +181,9 @@ def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
     step = 1e-6 * np.eye(at_x.size)
     slope = np.array([residuals(at_x + row) - residuals(at_x - row) for row in step]).T / 2e-6
     variance = np.einsum("mi,ij,mj->m", slope, inverse, slope)
-    motions = problem.motion_variances(state, covariance)
+    motions = kernels.motion_variances(state, problem.graph.chords, covariance)
     assert motions.ravel() == pytest.approx(variance[: motions.size], rel=1e-4)
-    ranges = problem.range_variances(state, covariance)
+    ranges = kernels.range_variances(state, problem.graph.ranges, covariance)
     assert ranges == pytest.approx(variance[motions.size :][: ranges.size], rel=1e-4)
 
 
@@ -240,8 +247,8 @@ def test_missed_attempts_say_farther_and_received_ones_nearer() -> None:
     weights = weights_of(problem, components, bases, Inliers.all_of(graph))
     state = problem.optimise(state, weights)
     distance = problem.attempt_distances(state)
-    covariance = problem.normal_equations(state, weights).covariance()
-    variance = problem.attempt_variances(state, covariance)
+    covariance = covariance_of(problem.normal_equations(state, weights))
+    variance = kernels.range_variances(state, graph.attempts.ranges, covariance)
     learned = learn_curve(problem, distance, np.sqrt(variance))
     assert update_factors(problem, distance, variance, *learned) > 0.0
     pull = problem.detection.weight * (problem.detection.mean_m - distance)

@@ -280,13 +280,9 @@ WALLS_SCALE_SD = 0.03
 """Standard deviation of the share of a distance by which ranges are too long where detection fades
 with distance, as through walls (as ``RANGE_SCALE_SD`` in :mod:`relpos.fusion.models.ranging`).
 
-What walls add a metre, step scales and growth take for their own. Mixed missions with walls, seeds
-900 to 943 chose: distances 1 to 7 % too long. Fresh ones, 1000 to 1119: mean NEES 3.1, 8.3 % beyond
-three sigmas, 17 of 28 broken without; 2.0, 4.1 % and 12 with .02; 1.8, 3.5 % and 10 so; 1.6, 3.0 %
-and 9 with .04. Real teams in offices: 1.07 to 1.94 without, .86 to 1.56 so
-(docs/notebook/missions.md)."""
+What walls add a metre, step scales and growth take for their own (docs/notebook/missions.md)."""
 
-_GRID_M = np.arange(LENGTH) * STEP_M
+GRID_M = np.arange(LENGTH) * STEP_M
 _OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
 _SHARES = np.array([[1.0], [4.0], [1.0]]) / 6.0
 """Three-point Gauss-Hermite rule: offsets in standard deviations, and their shares."""
@@ -317,7 +313,7 @@ def _family() -> _Family:
     near, edge, soft = (
         grid.reshape(-1, 1) for grid in np.meshgrid(_NEAR, _EDGE_M, _SOFTNESS, indexing="ij")
     )
-    exponent = (_GRID_M - edge) / (soft * edge)
+    exponent = (GRID_M - edge) / (soft * edge)
     curves = near / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
     curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
     single = np.float32
@@ -379,7 +375,7 @@ class Detection:
     def probability(self, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:
         """P(received) over distances (K,), averaged over their Gaussian errors."""
         place = distance_m + _OFFSETS * sigma_m
-        mean: Floats = (_SHARES * np.interp(place, _GRID_M, self.curve)).sum(axis=0)
+        mean: Floats = (_SHARES * np.interp(place, GRID_M, self.curve)).sum(axis=0)
         return mean
 
     def update(self, of: Round, distance_m: Floats, sigma_m: Floats) -> Floats:

@@ -22,7 +22,6 @@ from relpos.measurements import Measurement, Range
 SURE = 3.0
 """What is smaller than so many of its standard deviations is left in."""
 
-
 LEARNED_AFTER_S = 20.0
 """So much later it is looked up how high people were: first it has to be learned.
 

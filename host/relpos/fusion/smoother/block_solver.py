@@ -167,11 +167,6 @@ class Equations(NamedTuple):
         x = back_substitute(lower, w, side.reshape(*v.shape[:2], 1))
         return x[:, :, 0], constants
 
-    def covariance(self) -> Covariance:
-        """Blocks of the inverse; RelposError if it does not exist."""
-        knots, b, size = self.border.shape
-        return self.covariance_and_solution(np.zeros((knots, b, 0)), np.zeros((size, 0)))[0]
-
     def covariance_and_solution(
         self, columns: Floats, corner_columns: Floats
     ) -> tuple[Covariance, Floats, Floats]:

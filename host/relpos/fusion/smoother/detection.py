@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from relpos.fusion.arrays import Floats
-from relpos.fusion.models.detection import LENGTH, STEP_M, Detection
+from relpos.fusion.models.detection import GRID_M, STEP_M, Detection
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import DetectionFactors, Problem
 
@@ -59,7 +59,6 @@ _POINTS = np.linspace(-5.0, 5.0, 41)
 _POINT_SHARES = np.exp(-0.5 * _POINTS**2)
 # Of unit variance to the last digit: else thousands of attempts that say nothing would add up.
 _POINTS /= math.sqrt(float(_POINT_SHARES @ _POINTS**2 / _POINT_SHARES.sum()))
-_GRID_M = np.arange(LENGTH) * STEP_M
 
 
 def update_factors(
@@ -78,7 +77,7 @@ def update_factors(
     mean = (distance / variance - old * old_m) / precision
     deviation = 1.0 / np.sqrt(precision)
     place = np.maximum(mean[:, None] + deviation[:, None] * _POINTS, 0.0)
-    chance = np.interp(place, _GRID_M, curve)
+    chance = np.interp(place, GRID_M, curve)
     outcome = np.where(missed[:, None], np.log1p(-chance), np.log(chance))
     mass = _POINT_SHARES * np.exp(weight[:, None] * outcome)
     mass /= mass.sum(axis=1, keepdims=True)

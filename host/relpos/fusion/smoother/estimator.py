@@ -298,25 +298,18 @@ def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Pa
     chord = max(int(np.searchsorted(problem.graph.time_s, time_s)) - 1, 0)
     scale_at = int(problem.graph.chords.scale_at[chord])
     for k, name in enumerate(names):
-        rows.append(Parameter(time_s, name, None, "range_growth_m", *growth))
         own = scale_at + k
         grow = math.exp(float(value[own]))
-        rows.append(
-            Parameter(time_s, name, None, "step_scale", grow, grow * math.sqrt(spread[own, own]))
-        )
-        rows.append(
-            Parameter(
-                time_s, name, None, "heading_drift_rad_s", float(value[k]),
-                math.sqrt(spread[k, k]),
-            )
-        )  # fmt: skip
+        scale = grow, grow * math.sqrt(spread[own, own])
+        drift = float(value[k]), math.sqrt(spread[k, k])
+        rows += [
+            Parameter(time_s, name, None, "range_growth_m", *growth),
+            Parameter(time_s, name, None, "step_scale", *scale),
+            Parameter(time_s, name, None, "heading_drift_rad_s", *drift),
+        ]
     common = places.common_bias
     for own, (i, j) in enumerate(problem.graph.pairs, places.pair_bias.start):
         variance = spread[common, common] + spread[own, own] + 2.0 * spread[common, own]
-        rows.append(
-            Parameter(
-                time_s, names[i], names[j], "range_bias_m", float(value[common] + value[own]),
-                math.sqrt(max(float(variance), 0.0)),
-            )
-        )  # fmt: skip
+        bias = float(value[common] + value[own]), math.sqrt(max(float(variance), 0.0))
+        rows.append(Parameter(time_s, names[i], names[j], "range_bias_m", *bias))
     return tuple(rows)

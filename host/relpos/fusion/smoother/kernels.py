@@ -128,12 +128,7 @@ def add_motions(state: State, chords: Chords, weight: Floats, equations: Equatio
 
 @compiled
 def add_component_columns(
-    state: State,
-    chords: Chords,
-    force: Floats,
-    axis: Indices,
-    columns: Floats,
-    corner: Floats,
+    state: State, chords: Chords, force: Floats, axis: Indices, columns: Floats, corner: Floats
 ) -> None:
     """Add the negative derivative of the gradient by the logarithm of each variance component.
 

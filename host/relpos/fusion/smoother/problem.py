@@ -8,7 +8,7 @@ import numpy as np
 
 from relpos.fusion.arrays import Floats
 from relpos.fusion.smoother import kernels
-from relpos.fusion.smoother.block_solver import Covariance, Equations
+from relpos.fusion.smoother.block_solver import Equations
 from relpos.fusion.smoother.graph import Graph
 from relpos.fusion.smoother.kernels import State
 
@@ -104,18 +104,6 @@ class Problem:
         """Distance of every attempt, (Q,)."""
         nothing = np.zeros(self.detection.weight.size)
         return kernels.range_residuals(state, self.graph.attempts.ranges, nothing)
-
-    def motion_variances(self, state: State, covariance: Covariance) -> Floats:
-        """Posterior variances of the chords' residuals, (K - 1, N, 3)."""
-        return kernels.motion_variances(state, self.graph.chords, covariance)
-
-    def range_variances(self, state: State, covariance: Covariance) -> Floats:
-        """Posterior variances of the predicted ranges, (M,)."""
-        return kernels.range_variances(state, self.graph.ranges, covariance)
-
-    def attempt_variances(self, state: State, covariance: Covariance) -> Floats:
-        """Posterior variances of the attempts' distances, (Q,)."""
-        return kernels.range_variances(state, self.graph.attempts.ranges, covariance)
 
     def resolve_signs(self, state: State, variance_m2: float) -> None:
         """Give near ranges their expected sign.

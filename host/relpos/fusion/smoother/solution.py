@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relpos.fusion.arrays import Floats
-from relpos.fusion.smoother import detection
+from relpos.fusion.smoother import detection, kernels
 from relpos.fusion.smoother.block_solver import Covariance
 from relpos.fusion.smoother.inliers import inlier_probabilities
 from relpos.fusion.smoother.kernels import State
@@ -105,7 +105,8 @@ def smooth(
         pulled = 0.0
         if problem.graph.attempts.missed.any():
             distance = problem.attempt_distances(state)
-            variance = np.maximum(problem.attempt_variances(state, at.covariance), 1e-6)
+            attempts = problem.graph.attempts.ranges
+            variance = np.maximum(kernels.range_variances(state, attempts, at.covariance), 1e-6)
             if (k - DETECTION_FROM) % CURVE_EVERY == 0:
                 curve, weight = detection.learn_curve(problem, distance, np.sqrt(variance))
             pulled = detection.update_factors(problem, distance, variance, curve, weight)

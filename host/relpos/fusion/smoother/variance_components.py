@@ -67,7 +67,6 @@ CALIBRATED_PAIR_BIAS = 0.03**2
 CALIBRATED_GROWTH = 0.01**2
 """Of ranges whose antenna delays were calibrated: the common bias, a pair's, the growth (m^2)."""
 
-
 MOST_GO_ON = 0.98
 
 FAULT = np.array([JUMP_M**2, JUMP_M**2, math.pi**2 / 3.0])
@@ -201,11 +200,7 @@ class Linearisation(NamedTuple):
 
 
 def linearise(
-    problem: Problem,
-    state: State,
-    components: VarianceComponents,
-    bases: Floats,
-    weights: Weights,
+    problem: Problem, state: State, components: VarianceComponents, bases: Floats, weights: Weights
 ) -> Linearisation:
     """Return the covariance and the components' influence; RelposError if not observable."""
     graph, nodes = problem.graph, problem.nodes
@@ -248,7 +243,7 @@ def _prior_precision(nodes: int) -> Floats:
 def _step_motion(problem: Problem, at: Linearisation, components: VarianceComponents) -> float:
     """One Newton step of the motion components' logarithms; return the greatest change."""
     w = at.weights.motion
-    posterior = problem.motion_variances(at.state, at.covariance)
+    posterior = kernels.motion_variances(at.state, problem.graph.chords, at.covariance)
     square = w * problem.motion_residuals(at.state) ** 2
     free = np.maximum(1.0 - posterior * w, 0.0)
     slope = 0.5 * np.sum(at.shares * (square - free)[..., AXIS], axis=0)
@@ -317,7 +312,7 @@ def update_components(
     if not inliers.size:
         return change
     residual_m = problem.range_residuals(at.state)
-    posterior_m2 = problem.range_variances(at.state, at.covariance)
+    posterior_m2 = kernels.range_variances(at.state, problem.graph.ranges, at.covariance)
     v = components.range_m2
     # A sign that is not known adds to the error what it may have turned round.
     unsigned = problem.graph.range_m**2 - problem.range_m**2
