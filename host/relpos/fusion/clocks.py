@@ -48,9 +48,9 @@ class Clocks:
         off_s = self.offset_s.get(measurement.node, 0.0)
         if isinstance(measurement, Range):
             off_s += self.lateness_s
-        return (
-            measurement if off_s == 0.0 else replace(measurement, time_s=measurement.time_s - off_s)
-        )
+        if off_s == 0.0:
+            return measurement
+        return replace(measurement, time_s=measurement.time_s - off_s)
 
     def slew(
         self,

@@ -260,8 +260,7 @@ ANY_ANGLE_RAD = pi / sqrt(3.0)
 
 VAGUE_PAIR_M = 0.67
 """Greatest uncertainty of the distance between the places of a pair that is ``ok``: an error of
-2 m is then three deviations (``mission-split-hard``, seeds 620 and 621: 9.6 % of the ok
-pair-seconds err by more without this, 0.6 % with 1 m, 0.03 % with this)."""
+2 m is then three deviations (docs/notebook/missions.md)."""
 
 MAX_ALTERNATIVES = 16
 """At most so many modes are listed (run format, ``alternatives.csv``)."""

@@ -50,11 +50,7 @@ class Belief:
 
 
 def alternatives_of(
-    time_s: float,
-    nodes: Sequence[int],
-    weights: Floats,
-    poses: Floats,
-    covariances: Floats,
+    time_s: float, nodes: Sequence[int], weights: Floats, poses: Floats, covariances: Floats
 ) -> tuple[Alternative, ...]:
     """Give weights (K,), poses (K, N, 3), position covariances (K, N, 2, 2) as alternatives.
 

@@ -220,10 +220,7 @@ class Rewinder:
         pushed = self._forgotten + len(self._history)
         self._copies.append(
             _Copy(
-                self.timeline.frontier_s,
-                self.timeline.snapshot(),
-                self._copy_of(self.core),
-                pushed,
+                self.timeline.frontier_s, self.timeline.snapshot(), self._copy_of(self.core), pushed
             )
         )
         # What is late by the window may belong to a chord that began a report earlier.

@@ -35,7 +35,6 @@ of the time (``docs/notebook/large-teams.md``)."""
 KEPT_S = 20.0
 """What is younger is kept: a bank's newest estimate is never older."""
 
-
 NUCLEUS = 6
 """Nodes of the nucleus: a bank finds six within a minute or two."""
 

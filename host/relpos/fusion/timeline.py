@@ -246,9 +246,8 @@ class Timeline:
         for measurement in measurements:
             self._add(measurement)
         self._sort_in(inf if final else self._newest_s - self.reorder_s)
-        return (
-            chain(self._release(final=True), self._end()) if final else self._release(final=False)
-        )
+        released = self._release(final=final)
+        return chain(released, self._end()) if final else released
 
     def take_in(self, measurement: Measurement) -> bool:
         """Take one usable measurement; tell whether ``push_all(())`` may have anything by it.

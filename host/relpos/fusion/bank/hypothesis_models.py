@@ -48,16 +48,12 @@ died out then was missing when it mattered: teams in an office (``bench/recorded
 0 to 7) had NEES 1.53, 3.4 % over three sigmas, 0.72 m; 1.29, 2.3 %, 0.68 m with this and biases
 that pass; ``paper-p1``, 52000 to 52007: 0.185 m both, 0.20 with ten times the least weight."""
 
-
 DECIDED_AFTER_S, UNDECIDED_WEIGHT = 60.0, 0.05
 """So soon after the first ranges nothing is decided where starts are uncertain: there are no fewer
 hypotheses, and this is the least weight of each kind of range errors.
 
 Uncertain starts take what bodies and walls add to ranges: noise alone had 99 % of the weight after
-ten seconds, and the right kind 85 % after thirty. Six people who start at one place (0.5 m, 10
-degrees), three ranges a second and pair, body shadow 0.3 m, on 15 and on 30 m, seeds 540 to 545:
-NEES 2.2 and 2.1, 6 and 5 % over three sigmas without; 0.9 and 0.8, 0.4 and 0.2 % so; 0.7 and 0.6
-with four times the weight. 120 s are no better (docs/notebook/missions.md)."""
+ten seconds, and the right kind 85 % after thirty (docs/notebook/missions.md)."""
 
 
 class RangeErrors(IntEnum):

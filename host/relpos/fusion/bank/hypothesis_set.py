@@ -190,14 +190,11 @@ class HypothesisSet(HypothesisArrays):
         if s.constants > 0.0 and which.size:
             models.constants[which] = 1.0
             block, lane = self.at(which)
+            drifts = (1.0 - models.low_heading_noise[which]) * s.drift_rad_s**2
             for row in range(self.nodes):
-                drift, scale = (
-                    self._place(row, StateIndex.DRIFT),
-                    self._place(row, StateIndex.SCALE),
-                )
-                drifts = (1.0 - models.low_heading_noise[which]) * s.drift_rad_s**2
-                p[block, storage.triangle_place(drift, drift), lane] = drifts
-                p[block, storage.triangle_place(scale, scale), lane] = s.scale**2
+                for entry, variance in ((StateIndex.DRIFT, drifts), (StateIndex.SCALE, s.scale**2)):
+                    place = self._place(row, entry)
+                    p[block, storage.triangle_place(place, place), lane] = variance
 
     # -- resampling ----------------------------------------------------------------------------
 

@@ -49,9 +49,7 @@ VARIED, VARIED_AFTER, VARIED_RANGES = 0.05, 8, 200
 """Standard deviation of a pair's distance over its mean from which on it tells heights, after so
 many ranges, over at most so many.
 
-A crowd that keeps together may as well be a steep one. Ten people side by side (``two-abreast``,
-150 s, seeds 4400 to 4403): .36 m, NEES 1.1 without heights, 1.3 and 8.2 with, .38 and .9 so; where
-nothing is believed before distances have changed, floors (above) have .18 m in place of .13."""
+A crowd that keeps together may as well be a steep one (docs/notebook/missions.md)."""
 
 
 class Learned(NamedTuple):

@@ -103,9 +103,8 @@ class Relocalisation:
         grows without a range.
         """
         self._hypotheses.diffuse(row, way_m, covariance)
-        total_m2 = self.diffused_m2[row] = self.diffused_m2.get(row, 0.0) + float(
-            covariance.trace()
-        )
+        total_m2 = self.diffused_m2.get(row, 0.0) + float(covariance.trace())
+        self.diffused_m2[row] = total_m2
         if self._hypotheses.settings.hypotheses > 1 and total_m2 > LOST_M**2:
             self.lost[row] = math.sqrt(total_m2), self.lost.get(row, (0.0, 0.0))[1]
             self.ambiguous.add(row)

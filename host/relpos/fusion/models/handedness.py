@@ -16,9 +16,7 @@ BENT_M = 0.7
 """A way so far from a straight one has no mirror image with the same ranges.
 
 Until somebody has gone such a way, noise alone chooses between left and right where a heading was
-unknown. Vague starts (5 m, 1 rad) of teams drawn at random, 60 s: of 39 that were all ``ok`` one
-was mirrored for 11 s; with this none of 31 for more than 3 s (docs/notebook/starts.md).
-"""
+unknown (docs/notebook/starts.md)."""
 
 APART_M, REMEMBERED_M = 0.3, 10.0
 """Places of a way that are remembered are so far apart, and at most so far away.
@@ -31,12 +29,7 @@ ASIDE_M, BETWEEN_M = 0.7, 1.4
 """Three are in a line while their triangle is lower; it has two sides, so far apart.
 
 Who may have gone so far aside while in a line, by the deviation of its heading, leaves it to either
-side. Three walk straight on, one through the line of the others at 0.05 m/s
-(``tests/fusion/bank/test_mirrored_team.py``): of seeds 30 to 109 fourteen were ``ok`` on the wrong
-side for 8 to 45 s, now none. Of all nodes as many are ``ok`` as before in ``base``, ``walls``,
-``reboot``, and 1.7 % fewer in ``split-hard``; with half of it 2 to 4 % fewer of three people in
-``base`` (docs/notebook/missions.md).
-"""
+side. With half of it 2 to 4 % fewer of three people are ``ok`` (docs/notebook/missions.md)."""
 
 PLACED = 3
 """So many nodes that are known place all others, on the right side."""
@@ -50,10 +43,8 @@ CLEAR = 0.3
 
 CONTRADICTED, AGREED, LEAST_TURNS = 0.5, 0.8, 0.5
 """A team is mirrored where less than the first share of its turns is seen, once enough are
-remembered; it is believed again when the second share is. ``mission-split-hard``, 1500 s: at least
-0.84 in seeds 6003 and 6006; in 6009, while the team is mirrored, 0.4 after twelve seconds and down
-to -0.6. Of 22 missions and 26 mixed ones none was taken for mirrored (docs/notebook/missions.md).
-"""
+remembered; it is believed again when the second share is. As it is, at least 0.84 were seen; while
+mirrored, 0.4 after twelve seconds and down to -0.6 (docs/notebook/missions.md)."""
 
 FADE = 0.95
 """Share of what is remembered of turns that is left after an epoch."""

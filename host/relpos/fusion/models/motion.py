@@ -30,21 +30,15 @@ from relpos.fusion.timeline import Advance
 SCALE_WALK = 2e-5
 """Random walk of a step scale's logarithm, 1 per second of moving: 11 % in ten minutes.
 
-Teams that begin to crawl (``mission-crawl``, 400 s, seeds 0 to 7): NEES 2.5 with 3e-7, 1.4 with
-1e-5, 1.0 with 2e-5. Scales that are constant (``paper-p1`` with 10 %, 24 seeds): .205 m with each,
-.212 with 3e-5. docs/notebook/bank.md.
-"""
+Teams that begin to crawl need it; constant scales do not suffer (docs/notebook/bank.md)."""
 
 SCALES_TELL = 5.0
 """A range tells of its users' common step scale where the square of its slope in that is so many
 times the variance of its prediction.
 
 Where they walk side by side, a common scale changes their ranges by the noise of headings alone,
-and shorter steps always explain that noise better: the scale shrank for as long as they did so.
-With 0, 5 and 12, the error of four people who fan out after six minutes side by side has a NEES of
-5.4, 1.5 and 1.4; ``paper-h`` with a scale of 10 %, 24 seeds, .1 and .5 deg/s: .82, .82, .85 m and
-.90, .90, .94. docs/notebook/bank.md.
-"""
+and shorter steps always explain that noise better: the scale shrank for as long as they did so
+(docs/notebook/bank.md)."""
 
 
 def velocity_m_s(step: Advance) -> tuple[float, float]:

@@ -292,10 +292,8 @@ class ZeroMotionDetector:
             return False
         way = sum(math.hypot(x, y) for x, y, _ in recent)
         turned = sum(abs(turn) for _, _, turn in recent)
-        net = math.hypot(sum(x for x, _, _ in recent), sum(y for _, y, _ in recent))
-        return net <= STILL_RATIO * way and abs(sum(t for _, _, t in recent)) <= (
-            STILL_RATIO * turned
-        )
+        x, y, turn = (sum(of) for of in zip(*recent, strict=True))
+        return math.hypot(x, y) <= STILL_RATIO * way and abs(turn) <= STILL_RATIO * turned
 
 
 def vagueness(step: Advance) -> tuple[float, float] | None:

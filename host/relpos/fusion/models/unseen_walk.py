@@ -23,13 +23,11 @@ AXIS_M2_S2 = 0.5 * WALK_M_S**2
 LAST_M2_S2 = 0.1
 """Variance along each axis of the velocity that was reported last."""
 
-
 LEAST_M2 = 1e-6
 """Added to a position's variance: of two people all but their distance may have been taken out."""
 
 MOST_EXPLAINED = 0.95
 """Share of the velocity's variance that a position may explain."""
-
 
 TURNS_RAD2_S = 0.12
 """Variance by which a heading may change in a second: a right angle in twenty."""

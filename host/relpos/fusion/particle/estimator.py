@@ -137,11 +137,11 @@ class ParticleFilter:
         for node in nodes:
             self._known[node].received(step.time_s)
             self._seek(node)
+        z_m = {node: known.vertical.z_m for node, known in self._known.items()}
         if any(node in self.initialiser for node in nodes):
             # The search may end without a result; the ranges are usable all the same.
             self._ranges_used += len(step.ranges)
-            heights = {node: known.vertical.z_m for node, known in self._known.items()}
-            self.initialiser.update(step.time_s, step.ranges, self._positions(), heights)
+            self.initialiser.update(step.time_s, step.ranges, self._positions(), z_m)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._ranges_used += len(located)
@@ -149,12 +149,7 @@ class ParticleFilter:
                 np.array([self._row[r.node] for r in located]),
                 np.array([self._row[r.peer] for r in located]),
                 np.array([r.range_m for r in located]),
-                np.array(
-                    [
-                        self._known[r.node].vertical.z_m - self._known[r.peer].vertical.z_m
-                        for r in located
-                    ]
-                ),
+                np.array([z_m[r.node] - z_m[r.peer] for r in located]),
             )
 
     # -- initial poses -------------------------------------------------------------------------

@@ -151,12 +151,7 @@ def sort_by_node(first: Indices, second: Indices, rows: int) -> tuple[Indices, I
 
 @compiled
 def correct(
-    poses: Floats,
-    weights: Floats,
-    ranges: NodeRanges,
-    sigma_m: float,
-    floor: float,
-    result: Floats,
+    poses: Floats, weights: Floats, ranges: NodeRanges, sigma_m: float, floor: float, result: Floats
 ) -> None:
     """Multiply the weights by the ranges' likelihoods, eq. (6); each row of ``result`` sums to one.
 

@@ -183,10 +183,8 @@ def update(beliefs: Beliefs, interval: Interval) -> Update:
     prior, mean, variance = prior.reshape(shape), mean.reshape(shape), variance.reshape(shape)
     news = measured[:, None, None]
     rise_m, rise_m2 = _rise(interval, airs)
-    mean, variance = (
-        np.where(news, mean + rise_m, mean),
-        np.where(news, variance + rise_m2, variance),
-    )
+    mean = np.where(news, mean + rise_m, mean)
+    variance = np.where(news, variance + rise_m2, variance)
     usual = _usual(interval)[:, None]
     height_m, noise_m2 = interval.height_m[:, None, None], interval.variance_m2[:, None, None]
     off_m, total = height_m - mean, variance + noise_m2

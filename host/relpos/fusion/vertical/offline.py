@@ -14,9 +14,7 @@ from relpos.measurements import Height, Measurement, Motion
 
 
 def as_climbed(
-    measurements: Sequence[Measurement],
-    nodes: Iterable[int],
-    posts: frozenset[int] = frozenset(),
+    measurements: Sequence[Measurement], nodes: Iterable[int], posts: frozenset[int] = frozenset()
 ) -> list[Measurement]:
     """Return measurements with heights and ways on stairs as the vertical filter decides them.
 
