@@ -16,6 +16,7 @@ from relpos.errors import DeviceError
 from relpos.link.port import open_port
 from relpos.nodes import radio
 from support.command import relpos
+from support.pulled_out import pulled_out
 
 BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in radio.BAUD_CODES}
 
@@ -204,3 +205,11 @@ def test_the_command_writes_a_module():
 )
 def test_contradicting_arguments_are_wrong_usage(arguments):
     assert node_radio(*arguments).exit_code == 2
+
+
+def test_an_adapter_that_is_pulled_out_is_one_line_with_its_port(monkeypatch):
+    monkeypatch.setattr(radio, "GUARD_S", 0.1)
+    with pulled_out() as path:
+        done = node_radio(path, "--node", 5)
+    assert done.exit_code == 1
+    assert done.stderr.splitlines()[-1].startswith(f"relpos: {path}: the port vanished: ")

@@ -7,6 +7,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -30,6 +31,13 @@ READ_TIMEOUT_S = 0.05
 READ_BYTES = 4096
 PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")
 """Of Linux and macOS."""
+FAILURES: tuple[type[Exception], ...] = (serial.SerialException, OSError, TypeError)
+"""Of a port that vanishes; pyserial raises TypeError where it is closed under a waiting read."""
+if os.name == "posix":
+    import termios
+
+    FAILURES += (termios.error,)  # pyserial passes it on where it discards what has come in
+UNOPENED = (*FAILURES, ValueError)
 UNMARKED_FRAMES = 10
 """A reader that joins an emulated team in the middle gets a few frames before the first mark."""
 
@@ -256,7 +264,7 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
         device: serial.Serial = serial.serial_for_url(
             port, baudrate=baud, timeout=READ_TIMEOUT_S, exclusive=True
         )
-    except (serial.SerialException, OSError, ValueError) as error:
+    except UNOPENED as error:
         raise _cannot_open(port, error) from error
     return device
 
@@ -304,11 +312,17 @@ def incarnation(port: str) -> object:
 
 def send(device: Line, data: bytes) -> None:
     """Write ``data``, if there is any; DeviceError where the port has vanished."""
-    if not data:
-        return
+    if data:
+        with plugged_in(device):
+            device.write(data)
+
+
+@contextmanager
+def plugged_in(device: Line) -> Iterator[None]:
+    """Raise DeviceError where the open port vanishes meanwhile."""
     try:
-        device.write(data)
-    except (serial.SerialException, OSError, TypeError) as error:
+        yield
+    except FAILURES as error:
         raise vanished(device, error) from error
 
 
@@ -332,7 +346,7 @@ def _reason(error: Exception) -> str:
         return "not a serial port"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return str(error).splitlines()[0]
+    return str(error.args[-1] if error.args else error).splitlines()[0]
 
 
 def stopwatch() -> Callable[[], float]:
@@ -353,9 +367,6 @@ def observe(
     """
     clock = clock or stopwatch()
     while True:
-        try:
+        with plugged_in(device):
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
-        except (serial.SerialException, OSError, TypeError) as error:
-            # pyserial raises TypeError when the port is closed under a waiting read.
-            raise vanished(device, error) from error
         yield link.feed(data, clock()) if data else []

@@ -11,6 +11,7 @@ from typing import Protocol
 import serial
 
 from relpos.errors import DeviceError
+from relpos.link.port import plugged_in
 
 BOOT_BAUD = 115_200
 """Optiboot on the Uno, Arduino's STK500v2 on the Mega."""
@@ -169,14 +170,15 @@ def _exchange(
     device: serial.Serial, request: bytes, answer_bytes: int, silence_s: float = ANSWER_S
 ) -> bytes:
     """Return what is answered until it is whole, or nothing has come for ``silence_s``."""
-    device.reset_input_buffer()
-    device.write(request)
     answer = b""
-    until_s = time.monotonic() + silence_s
-    while len(answer) < answer_bytes and time.monotonic() < until_s:
-        if received := device.read(answer_bytes - len(answer)):
-            answer += received
-            until_s = time.monotonic() + silence_s
+    with plugged_in(device):
+        device.reset_input_buffer()
+        device.write(request)
+        until_s = time.monotonic() + silence_s
+        while len(answer) < answer_bytes and time.monotonic() < until_s:
+            if received := device.read(answer_bytes - len(answer)):
+                answer += received
+                until_s = time.monotonic() + silence_s
     return answer
 
 

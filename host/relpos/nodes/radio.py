@@ -16,7 +16,7 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link import xbee
-from relpos.link.port import BAUD
+from relpos.link.port import BAUD, plugged_in
 
 FACTORY_BAUD = 9600
 BAUD_CODES = {1200: 0, 2400: 1, 4800: 2, 9600: 3, 19200: 4, 38400: 5, 57600: 6, 115200: 7}
@@ -105,8 +105,7 @@ class CommandMode:
     def enter(self) -> bool:
         """Whether the module answers "+++"."""
         time.sleep(GUARD_S)
-        self.device.reset_input_buffer()
-        self.device.write(b"+++")
+        _write(self.device, b"+++")
         return self._answer(GUARD_S + ANSWER_S) == "OK"
 
     def get(self, command: str) -> int:
@@ -130,15 +129,15 @@ class CommandMode:
                 raise DeviceError(f"the XBee module does not confirm {command}")
 
     def _ask(self, line: str, wait_s: float = ANSWER_S) -> str:
-        self.device.reset_input_buffer()
-        self.device.write(line.encode() + b"\r")
+        _write(self.device, line.encode() + b"\r")
         return self._answer(wait_s)
 
     def _answer(self, wait_s: float) -> str:
         until_s = time.monotonic() + wait_s
         answer = bytearray()
-        while time.monotonic() < until_s and not answer.endswith(b"\r"):
-            answer += self.device.read(1)
+        with plugged_in(self.device):
+            while time.monotonic() < until_s and not answer.endswith(b"\r"):
+                answer += self.device.read(1)
         return answer.decode("ascii", errors="replace").strip()
 
 
@@ -180,11 +179,12 @@ class ApiMode:
         request = xbee.AtCommand(self._frame_id, command.encode(), value)
         # A module in use also delivers what it hears: only the answer to this frame counts.
         parser = xbee.Parser(escaped=self.escaped)
-        self.device.reset_input_buffer()
-        self.device.write(xbee.encode(request, escaped=self.escaped))
+        _write(self.device, xbee.encode(request, escaped=self.escaped))
         until_s = time.monotonic() + wait_s
         while time.monotonic() < until_s:
-            for frame in parser.feed(self.device.read(max(1, self.device.in_waiting))):
+            with plugged_in(self.device):
+                data = self.device.read(max(1, self.device.in_waiting))
+            for frame in parser.feed(data):
                 if isinstance(frame, xbee.AtResponse) and frame.frame_id == self._frame_id:
                     if frame.status != 0:
                         raise DeviceError(
@@ -192,6 +192,13 @@ class ApiMode:
                         )
                     return frame
         raise DeviceError(_refused(command, shown, ""))
+
+
+def _write(device: serial.Serial, data: bytes) -> None:
+    """Send; what has come in before is no answer."""
+    with plugged_in(device):
+        device.reset_input_buffer()
+        device.write(data)
 
 
 def _refused(command: str, value: int | None, answer: str) -> str:
