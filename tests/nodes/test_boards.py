@@ -3,8 +3,11 @@
 from types import SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
+from relpos.cli.main import app
 from relpos.nodes import boards
+from support.pulled_out import pulled_out
 
 LOADS_ADDRESS, READS_FLASH = 0x06, 0x14
 READ_S, CHUNK = 0.15, 64
@@ -49,3 +52,18 @@ def test_a_busy_computer_reads_a_boot_loader_to_its_end(monkeypatch, feeds_the_w
     monkeypatch.setattr(boards, "time", clock)
     warning = boards.warning(mega, boards.BOARDS["mega"])
     assert (warning is None) == feeds_the_watchdog
+
+
+def test_a_board_that_is_pulled_out_is_one_line_with_its_port():
+    with pulled_out() as path:
+        done = CliRunner().invoke(app, ["node", "flash", path])
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"relpos: {path}: the port vanished: ")
+
+
+@pytest.mark.parametrize("option", ["--key-file", "--old-key-file"])
+def test_a_key_that_cannot_be_read_is_told_before_a_board_is_touched(tmp_path, option):
+    with pulled_out() as path:
+        done = CliRunner().invoke(app, ["node", "flash", path, option, str(tmp_path / "no.key")])
+    assert done.exit_code == 1
+    assert "no.key: no key can be read: No such file" in done.stderr

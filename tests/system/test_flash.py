@@ -247,6 +247,24 @@ def test_several_boards_need_a_choice_and_a_missing_board_is_reported():
             'avrdude: ser_open(): can\'t open device "/dev/x": Device or resource busy',
             "port cannot",
         ),
+        (
+            "avrdude OS error: cannot open port /dev/x: No such file or directory\n"
+            "avrdude error: unable to open programmer arduino on port /dev/x\n\n"
+            "avrdude done.  Thank you.\n\n*** [upload] Error 1",
+            "vanished",
+        ),
+        ("avrdude OS error: cannot open port /dev/x: Permission denied", "port cannot"),
+        (
+            "avrdude: ser_send(): write error: Input/output error\n\n"
+            "avrdude done.  Thank you.\n\n*** [upload] Error 1",
+            "write error: Input/output error",
+        ),
+        ("Platform Manager: Installing atmelavr\nHTTPClientError: ", "needs the Internet"),
+        (
+            "Error: You are not connected to the Internet.\nPlatformIO needs the Internet "
+            "connection to download dependent packages",
+            "needs the Internet",
+        ),
         ("node.cpp:12:3: error: 'x' was not declared\n*** [node.o] Error 1", "does not build"),
         ("avrdude: verification error; content mismatch", "read back"),
         ("Something else\n\n", "Something else"),
@@ -273,6 +291,15 @@ def test_the_firmware_is_built_for_the_sensor_that_is_wired(monkeypatch, imu, fl
     monkeypatch.setattr(upload.subprocess, "run", run)
     assert upload.upload(boards.BOARDS["uno"], "/dev/x", imu=imu) == 30000
     assert asked == [flags]
+
+
+def test_an_uploader_that_prints_no_text_is_reported(tmp_path, monkeypatch):
+    tool = tmp_path / "pio"
+    tool.write_bytes(b"#!/bin/sh\nprintf 'port /dev/\\377: error\\n'; exit 1\n")
+    tool.chmod(0o755)
+    monkeypatch.setattr(upload, "platformio", lambda _: [str(tool)])
+    with pytest.raises(DeviceError, match="the upload failed: port /dev/\N{REPLACEMENT CHARACTER}"):
+        upload.upload(boards.BOARDS["uno"], "/dev/x")
 
 
 def test_a_missing_platformio_is_reported(tmp_path, monkeypatch):

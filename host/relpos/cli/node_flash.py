@@ -75,6 +75,7 @@ def flash(
         raise typer.BadParameter("say where: --key-file FILE", param_hint="--new")
     if new and key_file is not None and key_file.exists():
         raise DataError(f"{key_file} exists already: a key is not overwritten")
+    team_key(None if new else key_file), team_key(old_key_file)  # before anything is written
     found = port or boards.find_port()
     with closing(open_port(found, boards.BOOT_BAUD)) as device:
         kind = boards.check(device, None if board is None else str(board))

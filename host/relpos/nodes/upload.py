@@ -52,6 +52,7 @@ def upload(board: Board, port: str, imu: str = IMU[0]) -> int | None:
             env={**os.environ, **_environment(root, imu)},
             capture_output=True,
             text=True,
+            errors="replace",
             timeout=UPLOAD_WITHIN_S,
             check=False,
         )
@@ -81,14 +82,20 @@ def _environment(root: Path, imu: str) -> dict[str, str]:
 def why(printed: str) -> str:
     """Return the cause of a failed upload in one line, from PlatformIO's and avrdude's output."""
     low = printed.lower()
+    if "httpclienterror" in low or "internet connection" in low:
+        return "PlatformIO cannot fetch its compiler: the first time it needs the Internet"
     if "error:" in low and "avrdude" not in low:
         line = next(line for line in printed.splitlines() if "error:" in line.lower())
         return f"the firmware does not build: {line.strip()}"
-    if "can't open device" in low or "busy" in low:
+    if re.search("(can't open device|cannot open port) .*no such", low):
+        return "the port has vanished: plug the board in and write the firmware again"
+    if "can't open device" in low or "cannot open port" in low or "busy" in low:
         return "the port cannot be opened: does another program hold it?"
     if any(words in low for words in _SILENT):
         return f"the board does not answer: {SWITCH}"
     if "verification error" in low or "mismatch" in low:
         return "the program does not read back as it was written: is the cable good? Try again"
     lines = [line for line in printed.splitlines() if line.strip()]
+    # The cause comes before the frames that make, SCons and avrdude put around it.
+    lines = [line for line in lines if "error" in line.lower() and "***" not in line] or lines
     return f"the upload failed: {lines[-1].strip() if lines else 'PlatformIO gave no reason'}"
