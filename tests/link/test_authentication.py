@@ -2,6 +2,7 @@
 
 import hashlib
 import hmac
+import resource
 import stat
 from collections import deque
 
@@ -502,3 +503,14 @@ def test_a_node_under_another_key_is_told_though_others_are_heard():
         decoder.feed(motion(n, 1.0 + n, node=2), 1.0 + n)
     (remark,) = decoder.remarks
     assert "another key" in remark
+
+
+def test_a_key_for_which_the_disk_has_no_room_leaves_no_file(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        with pytest.raises(DataError, match=r"team\.key: cannot be written: "):
+            write_new_key(tmp_path / "team.key")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())

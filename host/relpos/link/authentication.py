@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from relpos.errors import DataError
-from relpos.files import write_whole
+from relpos.files import sync_folder, write_whole
 from relpos.protocol import messages as wire
 from relpos.said import Said
 
@@ -166,12 +166,19 @@ def write_new_key(path: Path) -> bytes:
     key = secrets.token_bytes(wire.KEY_BYTES)
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(handle, "w", encoding="ascii") as file:
+                file.write(key.hex() + "\n")
+                file.flush()
+                os.fsync(file.fileno())  # nodes are given it next, and obey nobody without it
+        except OSError:
+            path.unlink()
+            raise
     except FileExistsError as error:
         raise DataError(f"{path} exists already: a key is not overwritten") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be written: {error.strerror}") from error
-    with os.fdopen(handle, "w", encoding="ascii") as file:
-        file.write(key.hex() + "\n")
+    sync_folder(path.parent)
     return key
 
 
