@@ -1,9 +1,13 @@
 """`relpos doctor`: what it says of a computer and a port that are not as they should be."""
 
 import json
+import os
+import subprocess
+import sys
 import time
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +21,8 @@ from relpos.errors import DeviceError
 from relpos.fusion import ROOMS, kernel_cache
 from relpos.link import xbee
 from relpos.link.authentication import write_new_key
+from relpos.nodes import radio
+from support.pulled_out import pulled_out
 from support.command import relpos
 
 PORT = "/dev/ttyUSB0"
@@ -148,6 +154,43 @@ def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):
     state, _, remedy = finding(installed(tmp_path, writable=False), "estimators")
     assert state == "wrong"
     assert "NUMBA_CACHE_DIR" in remedy
+
+
+def test_kernels_that_a_read_only_home_refuses_are_wrong(tmp_path):
+    (tmp_path / "home").touch()  # no folder can be made in it, not even by root
+    program = (
+        "from pathlib import Path\nfrom relpos.doctor import computer, installation\n"
+        "print(*installation.look(computer.Computer(), None, Path('.')), sep='\\n')\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment | {"XDG_CACHE_HOME": str(tmp_path / "home")},
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert f"cannot be stored in {tmp_path}/home/relpos/kernels" in done.stdout
+
+
+def test_a_folder_in_another_user_s_closed_folder_cannot_be_written(monkeypatch):
+    def closed(path):
+        if path != Path("/closed") and path != Path("/"):
+            raise PermissionError(path)
+        return True
+
+    monkeypatch.setattr(Path, "exists", closed)
+    monkeypatch.setattr(Path, "is_dir", lambda _: True)
+    monkeypatch.setattr(os, "access", lambda path, _: path == Path("/"))
+    assert not Computer().may_write(Path("/closed/folder/of/records"))
+
+
+def test_processes_whose_names_are_cut_amid_a_letter_are_listed(tmp_path):
+    program = tmp_path / ("ü" * 9)
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([program, "60"]) as process:
+        try:
+            assert Computer().processes()[process.pid].startswith("üüü")
+        finally:
+            process.kill()
 
 
 def test_the_key_has_to_be_one_and_to_be_the_owners_alone(tmp_path):
@@ -322,6 +365,15 @@ def test_a_port_that_does_not_open_is_wrong():
     assert finding(found, "coordinator")[:2] == (
         "wrong", f"{PORT}: cannot open the serial port: another program has it open",
     )  # fmt: skip
+
+
+def test_an_adapter_that_is_pulled_out_meanwhile_is_wrong(monkeypatch):
+    monkeypatch.setattr(radio, "GUARD_S", 0.01)
+    with pulled_out() as path:
+        computer = Pretended(listed=(SerialPort(path, "", None, None),))
+        state, words, _ = finding(devices.look(computer, path), "coordinator")
+    assert state == "wrong"
+    assert f"{path}: the port vanished" in words
 
 
 # -- the command -----------------------------------------------------------------------------------

@@ -39,7 +39,12 @@ class Computer:
         """Return what a command prints, "" where it is missing, fails or does not end."""
         try:
             done = subprocess.run(
-                command, capture_output=True, text=True, timeout=COMMAND_WITHIN_S, check=False
+                command,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=COMMAND_WITHIN_S,
+                check=False,
             )
         except (OSError, subprocess.TimeoutExpired):
             return ""
@@ -50,7 +55,8 @@ class Computer:
         found = {}
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # it may have ended meanwhile
-                found[int(folder.name)] = (folder / "comm").read_text().strip()
+                # The system cuts a name after 15 bytes, also amid a letter.
+                found[int(folder.name)] = (folder / "comm").read_text(errors="replace").strip()
         return found
 
     def holders(self, device: str) -> list[str]:
@@ -107,14 +113,11 @@ class Computer:
 
     def free_bytes(self, folder: Path) -> int:
         """Return the free bytes on the disk of ``folder``, which may not exist yet."""
-        while not folder.exists() and folder != folder.parent:
-            folder = folder.parent
-        return shutil.disk_usage(folder).free
+        return shutil.disk_usage(_there(folder)).free
 
     def may_write(self, folder: Path) -> bool:
         """Return whether files can be written to the folder, which may not exist yet."""
-        while not folder.exists() and folder != folder.parent:
-            folder = folder.parent
+        folder = _there(folder)
         return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
     def now(self) -> datetime:
@@ -128,3 +131,13 @@ class Computer:
     def environment(self, name: str) -> str:
         """Return an environment variable, or ""."""
         return os.environ.get(name, "")
+
+
+def _there(folder: Path) -> Path:
+    """Return the folder, or the first above it that this user can see."""
+    while folder != folder.parent:
+        with suppress(PermissionError):
+            if folder.exists():
+                break
+        folder = folder.parent
+    return folder

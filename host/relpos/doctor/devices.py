@@ -152,7 +152,8 @@ def _settings(access: Access, wanted: list[Parameter], remedy: str) -> Iterator[
         try:
             value = access.get(parameter.command)
         except DeviceError as error:
-            off.append(str(error))
+            if str(error) not in off:  # each question to a port that has vanished fails alike
+                off.append(str(error))
             continue
         if value != parameter.value:
             words = f"{parameter.command}={value:X} instead of {parameter.value:X} "

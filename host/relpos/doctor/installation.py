@@ -68,11 +68,13 @@ def _kernels(computer: Computer) -> Finding:
 
     name = "estimators"
     folder = kernel_cache.root(computer.environment("NUMBA_CACHE_DIR"))
+    if kernel_cache.refused:
+        folder = kernel_cache.refused[0]
     if not computer.may_write(folder):
         return wrong(
             name,
             f"compiled code cannot be stored in {folder}: every start compiles again",
-            "choose a writable folder: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
+            "choose a folder that you can write: export NUMBA_CACHE_DIR=FOLDER",
         )
     if not kernel_cache.is_complete({room for rooms in ROOMS.values() for room in rooms}, folder):
         return hint(

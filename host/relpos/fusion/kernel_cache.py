@@ -22,6 +22,8 @@ import platformdirs
 FUSION = Path(__file__).parent
 _COMPLETE = "complete"
 """This file stands in a room's folder once its kernels have been compiled."""
+refused: list[Path] = []
+"""The folder of all kernels, where it cannot be written and a temporary one takes its place."""
 
 
 def root(chosen: str | None = None) -> Path:
@@ -77,6 +79,7 @@ def folder_here(room: Path) -> Path:
         with tempfile.TemporaryFile(dir=kept):
             return kept
     except OSError:
+        refused.append(kept.parent)
         temporary = tempfile.mkdtemp(prefix="relpos-")
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         os.environ["NUMBA_CACHE_DIR"] = temporary
