@@ -37,7 +37,7 @@ if os.name == "posix":
     import termios
 
     FAILURES += (termios.error,)  # pyserial passes it on where it discards what has come in
-UNOPENED = (*FAILURES, ValueError)
+UNOPENED: tuple[type[Exception], ...] = (*FAILURES, ValueError)
 UNMARKED_FRAMES = 10
 """A reader that joins an emulated team in the middle gets a few frames before the first mark."""
 
