@@ -12,6 +12,7 @@ unexport PYTHONDONTWRITEBYTECODE
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 # A stamp stands for what pip put into .venv, and goes with it.
+MADE := $(VENV)/.relpos-made
 RUN := $(VENV)/.relpos-run
 DEVELOP := $(VENV)/.relpos-develop
 FUZZ := $(VENV)/.relpos-fuzz
@@ -23,6 +24,13 @@ PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
 # Part of the installation, so that no first start, and no test, waits for it.
 compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
+# Where .venv was moved or copied, or its Python replaced, its scripts lead elsewhere: it is made anew.
+made-by = $(PYTHON) -c 'import sys; print(sys.prefix, *sys.version_info[:2])'
+ifneq ($(wildcard $(MADE)),)
+ifneq ($(shell $(made-by) 2>&1),$(shell cat $(MADE)))
+.PHONY: $(MADE)
+endif
+endif
 # What both boards' firmware is made of; PlatformIO takes three seconds to see that nothing changed.
 FIRMWARE := platformio.ini tools/pio $(shell find firmware tools/platformio tools/*.py -type f -not -name '*.pyc')
 BOARDS := .build/pio/.relpos-boards
@@ -135,17 +143,18 @@ bare-root: ## as root: README's commands in a bare Debian, SUITE=trixie RUN="dem
 clean: ## remove what was built; .venv stays
 	rm -rf .build .pio out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
-$(PYTHON): | system-demo
+$(MADE): | system-demo
 	$(call title,Setting up .venv)
-	"$$(tools/find_python.sh)" -m venv $(VENV)
+	"$$(tools/find_python.sh)" -m venv $(if $(wildcard $(MADE)),--clear )$(VENV)
+	@$(made-by) >$@
 
-$(RUN): pyproject.toml | $(PYTHON)
+$(RUN): pyproject.toml $(MADE)
 	$(call title,Installing relpos and its libraries)
 	$(PIP) --editable '.[view,recording,report]'
 	$(compile-kernels)
 	@touch $@
 
-$(DEVELOP): pyproject.toml | $(PYTHON)
+$(DEVELOP): pyproject.toml $(MADE)
 	$(call title,Installing the tools for tests and firmware)
 	$(PIP) --editable '.[all,docs,test,lint,firmware]'
 	$(compile-kernels)
