@@ -22,8 +22,8 @@ from relpos.fusion import ROOMS, kernel_cache
 from relpos.link import xbee
 from relpos.link.authentication import write_new_key
 from relpos.nodes import radio
-from support.pulled_out import pulled_out
 from support.command import relpos
+from support.pulled_out import pulled_out
 
 PORT = "/dev/ttyUSB0"
 CH340 = SerialPort(PORT, "USB Serial", 0x1A86, 0x7523)
