@@ -3,13 +3,13 @@
 import os
 import re
 import select
-import subprocess
 import termios
 import threading
 import time
 import tty
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -279,27 +279,44 @@ def test_a_failed_upload_is_reported_with_its_cause(output, words):
 @pytest.mark.parametrize(
     ("imu", "flags"), [("mpu9150", None), ("mpu9250", "-Wall -DRELPOS_IMU=MPU9250")]
 )
-def test_the_firmware_is_built_for_the_sensor_that_is_wired(monkeypatch, imu, flags):
-    asked = []
-
-    def run(command, **options):
-        asked.append(options["env"].get("PLATFORMIO_BUILD_FLAGS"))
-        return subprocess.CompletedProcess(command, 0, "30000 bytes of flash verified", "")
-
+def test_the_firmware_is_built_for_the_sensor_that_is_wired(tmp_path, monkeypatch, imu, flags):
     if flags:
         monkeypatch.setenv("PLATFORMIO_BUILD_FLAGS", "-Wall")
-    monkeypatch.setattr(upload.subprocess, "run", run)
+    asked = tmp_path / "asked"
+    script = (
+        f'printf "${{PLATFORMIO_BUILD_FLAGS-none}}" >{asked}; echo 30000 bytes of flash verified'
+    )
+    monkeypatch.setattr(upload, "platformio", lambda _: [made(tmp_path, script)])
     assert upload.upload(boards.BOARDS["uno"], "/dev/x", imu=imu) == 30000
-    assert asked == [flags]
+    assert asked.read_text() == (flags or "none")
+
+
+def made(folder, script):
+    """Return the path of a program that stands for PlatformIO."""
+    tool = folder / "pio"
+    tool.write_text(f"#!/bin/sh\n{script}\n")
+    tool.chmod(0o755)
+    return str(tool)
 
 
 def test_an_uploader_that_prints_no_text_is_reported(tmp_path, monkeypatch):
-    tool = tmp_path / "pio"
-    tool.write_bytes(b"#!/bin/sh\nprintf 'port /dev/\\377: error\\n'; exit 1\n")
-    tool.chmod(0o755)
-    monkeypatch.setattr(upload, "platformio", lambda _: [str(tool)])
+    script = "printf 'port /dev/\\377: error\\n'; exit 1"
+    monkeypatch.setattr(upload, "platformio", lambda _: [made(tmp_path, script)])
     with pytest.raises(DeviceError, match="the upload failed: port /dev/\N{REPLACEMENT CHARACTER}"):
         upload.upload(boards.BOARDS["uno"], "/dev/x")
+
+
+def test_an_uploader_that_hangs_is_ended_with_all_that_it_has_started(tmp_path, monkeypatch):
+    script = f"sleep 600 & echo $! >{tmp_path}/pid; wait"
+    monkeypatch.setattr(upload, "platformio", lambda _: [made(tmp_path, script)])
+    monkeypatch.setattr(upload, "UPLOAD_WITHIN_S", 1.0)
+    began_s = time.monotonic()
+    with pytest.raises(DeviceError, match="^/dev/x: the upload took over 1 s$"):
+        upload.upload(boards.BOARDS["uno"], "/dev/x")
+    assert time.monotonic() - began_s < 60.0
+    started = Path(f"/proc/{(tmp_path / 'pid').read_text().strip()}/stat")
+    # Nobody's child any more: gone, or about to be.
+    assert not started.exists() or ") Z " in started.read_text()
 
 
 def test_a_missing_platformio_is_reported(tmp_path, monkeypatch):

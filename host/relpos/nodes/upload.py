@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from relpos import paths
@@ -45,24 +47,36 @@ def upload(board: Board, port: str, imu: str = IMU[0]) -> int | None:
     """
     root = paths.firmware_project()
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
-    try:
-        done = subprocess.run(
-            [*command, "--upload-port", port],
-            cwd=root,
-            env={**os.environ, **_environment(root, imu)},
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=UPLOAD_WITHIN_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise DeviceError(f"{port}: the upload took over {UPLOAD_WITHIN_S:g} s") from error
-    printed = done.stdout + done.stderr
-    if done.returncode != 0:
+    with subprocess.Popen(
+        [*command, "--upload-port", port],
+        cwd=root,
+        env={**os.environ, **_environment(root, imu)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    ) as process:
+        try:
+            printed = "".join(process.communicate(timeout=UPLOAD_WITHIN_S))
+        except BaseException as error:
+            _end(process)
+            if isinstance(error, subprocess.TimeoutExpired):
+                words = f"{port}: the upload took over {UPLOAD_WITHIN_S:g} s"
+                raise DeviceError(words) from error
+            raise
+    if process.returncode != 0:
         raise DeviceError(f"{port}: {why(printed)}")
     verified = re.search(r"(\d+) bytes of flash verified", printed)
     return int(verified[1]) if verified else None
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End PlatformIO and its uploader, which would hold the port without it."""
+    if os.name == "posix":
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
 
 
 def _environment(root: Path, imu: str) -> dict[str, str]:
