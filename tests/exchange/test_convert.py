@@ -733,6 +733,13 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
             "is no longitude and latitude",
         ),
         ("Point", "[11.575,48.137]", '{"kind":"landmark"}', "a landmark needs an id"),
+        ("Point", "[11.575,48.137]", '{"id":"\\ud800"}', "a landmark needs an id"),
+        (
+            "Point",
+            "[11.575,48.137]",
+            f'{{"node":1,"kind":"track","of":"truth","time_s":[{10**400}]}}',
+            "a time for each of its 1",
+        ),
     ],
 )
 def test_a_wrong_feature_is_reported_in_one_line(
@@ -741,6 +748,39 @@ def test_a_wrong_feature_is_reported_in_one_line(
     (tmp_path / "a.geojson").write_text(TRACK.format(shape, coordinates, properties))
     words = ("--pin", PIN, "--to", "run", "--out", tmp_path / "out")
     assert complaint in refused(tmp_path / "a.geojson", *words)
+
+
+@pytest.mark.parametrize("course", ["1e999", f"{10**400}", '"north"'])
+def test_a_course_that_is_no_number_is_an_unknown_heading(tmp_path: Path, course: str) -> None:
+    properties = f'{{"node":1,"kind":"track","of":"truth","time_s":[1],"course_deg":[{course}]}}'
+    (tmp_path / "a.geojson").write_text(TRACK.format("Point", "[11.575,48.137]", properties))
+    convert(tmp_path / "a.geojson", "--pin", PIN, "--to", "run", "--out", tmp_path / "out")
+    assert [row.heading_rad for row in load_run(tmp_path / "out").truth] == [None]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "complaint"),
+    [
+        ("truth_1.tum", "5e7 1 0 0 0 0 0 1\n", "time_s 5e+07 is not between -86400 and 604800"),
+        ("estimate_1.tum", "0 1 2e8 0 0 0 0 1\n", "y_m 2e+08 is not between"),
+        ("truth_99999999999999999999.tum", "0 1 0 0 0 0 0 1\n", "node 1e+20 is not between"),
+        (
+            "a.gpx",
+            '<gpx version="1.1"><trk><number>1</number><type>truth</type><trkseg>'
+            '<trkpt lat="nan" lon="11"><time>2026-05-04T09:30:00Z</time></trkpt>'
+            "</trkseg></trk></gpx>",
+            "x_m nan is not between",
+        ),
+    ],
+)
+def test_what_no_run_can_hold_is_refused_instead_of_written(
+    tmp_path: Path, name: str, content: str, complaint: str
+) -> None:
+    (tmp_path / name).write_text(content)
+    line = refused(tmp_path / name, "--pin", PIN, "--to", "run", "--out", tmp_path / "out")
+    assert complaint in line
+    assert name in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:

@@ -22,11 +22,12 @@ from relpos.exchange.content import (
 from relpos.exchange.formats import TRAITS, Format, Kind, format_of
 from relpos.exchange.times import iso_of, possible
 from relpos.geodesy import MapFrame, Pin, place
+from relpos.measurements import BOUNDS, Truth, out_of_bounds
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
 from relpos.runs.run import RECEIVED, TABLE_NAMES, Run, holds_run, load_run, save_run
-from relpos.runs.table import find_table, remove_table
+from relpos.runs.table import MOST_WHOLE, find_table, remove_table
 
 _Written = tuple[list[Path], list[str]]
 
@@ -162,6 +163,7 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
         landmarks = maps.read_landmarks(source, frame)
     if not points and not landmarks:
         raise DataError(f"{source}: neither tracks nor landmarks in it")
+    _check(source, [p for own in points.values() for p in own], landmarks)
     run, estimates = base.run, base.estimates
     if points.get(Kind.TRUTH):
         run = replace(run, truth=as_truth(points[Kind.TRUTH]))
@@ -174,6 +176,17 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
             raise DataError(f"{source}: {error}") from None
     untouched = base.recording if not points.get(Kind.ESTIMATE) else None
     return Content(run, estimates, start_unix_s, tuple(remarks), untouched)
+
+
+def _check(source: Path, points: Sequence[Point], landmarks: Sequence[Landmark]) -> None:
+    """Raise DataError where a run with these rows could not be read."""
+    surveyed = [Truth(0.0, 0, mark.x_m, mark.y_m, None, mark.z_m) for mark in landmarks]
+    for row in (*as_truth(points), *surveyed):
+        field = "node" if row.node > MOST_WHOLE else out_of_bounds(row)
+        if field is not None:
+            low, high = BOUNDS.get(field, (0, MOST_WHOLE))
+            words = f"{field} {getattr(row, field):g} is not between {low:g} and {high:g}"
+            raise DataError(f"{source}: at {row.time_s:g} s: {words}")
 
 
 def _maps_of(form: Format) -> ModuleType:

@@ -170,7 +170,7 @@ def read_tracks(
             x_m, y_m, z_m = _world(where, position, frame)
             heading_rad = (
                 math.remainder(frame.bearing_rad - math.radians(course), 2.0 * math.pi)
-                if isinstance(course, int | float)
+                if _is_number(course)
                 else math.nan
             )
             points.setdefault(what, []).append(Point(time_s, whose, x_m, y_m, z_m, heading_rad))
@@ -185,9 +185,10 @@ def read_landmarks(path: Path, frame: MapFrame) -> list[Landmark]:
             continue
         where = f"{path}: feature {number}"
         known = properties.get("id", properties.get("name"))
-        if known is None or not str(known).strip():
+        mark = "" if known is None else str(known).strip()
+        # Half a surrogate pair, which JSON can hold, is no text that a file can.
+        if not mark or any("\ud800" <= letter <= "\udfff" for letter in mark):
             raise DataError(f"{where}: a landmark needs an id (property id or name)")
-        mark = str(known).strip()
         if mark in landmarks:
             raise DataError(f"{where}: landmark {mark!r} is there twice")
         x_m, y_m, z_m = _world(where, coordinates, frame)
@@ -278,4 +279,5 @@ def _world(where: str, position: Any, frame: MapFrame) -> tuple[float, float, fl
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """A whole number of hundreds of digits is none here: it fits no float."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
