@@ -1,6 +1,9 @@
 """Public recordings: small copies of the sources' files, as the converters meet them."""
 
+import errno
 import json
+import socket
+import threading
 import zipfile
 
 import numpy as np
@@ -8,7 +11,7 @@ import pytest
 
 from relpos.errors import DataError
 from relpos.recordings import catalog, download, handheld, lowerback
-from relpos.recordings.tables import Archive
+from relpos.recordings.tables import Archive, ConvertedRun
 from relpos.runs import load_run
 from support.command import relpos
 
@@ -89,6 +92,75 @@ def test_a_source_that_changed_gives_one_clear_line_and_writes_nothing(lowerback
     with pytest.raises(DataError, match="the source has changed"):
         download.get("walk_lowerback_20m", out, lowerback_source / "broken.zip")
     assert not out.exists()
+
+
+def zipped(folder, path, compression=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for file in folder.rglob("*.*"):
+            archive.write(file, f"top/{file.relative_to(folder)}")
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("at", [0.02, 0.3, 0.6])
+def test_a_damaged_zip_gives_one_clear_line(lowerback_source, no_checksum, tmp_path, at):
+    whole = bytearray(zipped(lowerback_source, tmp_path / "source.zip"))
+    begin = int(at * len(whole))
+    whole[begin : begin + 40] = bytes(range(60, 100))
+    (tmp_path / "source.zip").write_bytes(whole)
+    with pytest.raises(DataError, match="walk_lowerback_20m: "):
+        download.get("walk_lowerback_20m", tmp_path / "out", tmp_path / "source.zip")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_download_that_breaks_off_is_no_changed_source(lowerback_source, monkeypatch, tmp_path):
+    whole = zipped(lowerback_source, tmp_path / "source.zip")
+    head = b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(whole)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            line, _ = server.accept()
+            with line:
+                line.recv(4096)
+                line.sendall(head + whole[:-100])
+
+        threading.Thread(target=answer, daemon=True).start()
+        address = f"http://127.0.0.1:{server.getsockname()[1]}/source.zip"
+        monkeypatch.setattr(catalog.Source, "address", address)
+        with pytest.raises(DataError, match=r"source\.zip: broke off 100 bytes before its end"):
+            download.get("walk_lowerback_20m", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("names", [["...txt"], ["twice.txt", "twice.csv"]])
+def test_a_name_in_a_source_leads_to_no_other_folder_and_no_run_over_another(names, tmp_path):
+    lines = ["990\tTYPE_WAYPOINT\t1.5\t2.5", "1200\tTYPE_WAYPOINT\t3\t4"]
+    lines += [f"{1000 + k}\t{kind}\t1\t0\t0\t3" for k in range(5) for kind in handheld.KINDS]
+    with zipfile.ZipFile(tmp_path / "source.zip", "w") as archive:
+        for name in names:
+            archive.writestr(f"top/{handheld.FOLDER}{name}", "\n".join(lines))
+    out = tmp_path / "sub" / "out"
+    with pytest.raises(DataError, match="runs with one name, or with none"):
+        download.get("walk_handheld_waypoints", out, tmp_path / "source.zip")
+    assert [file.name for file in tmp_path.iterdir()] == ["source.zip"]
+
+
+def test_on_a_full_disk_the_folder_is_named_and_no_part_of_a_set_is_left(
+    lowerback_source, no_checksum, monkeypatch, tmp_path
+):
+    for ending in (".json", "_lb.txt"):
+        text = (lowerback_source / "GaitData" / f"1-1{ending}").read_text()
+        (lowerback_source / "GaitData" / f"2-1{ending}").write_text(text)
+    write = ConvertedRun.write
+
+    def full(run, folder):
+        write(run, folder)
+        if run.name == "2-1":
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ConvertedRun, "write", full)
+    with pytest.raises(DataError, match="out: No space left on device"):
+        download.get("walk_lowerback_20m", tmp_path / "out", lowerback_source)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_source_that_moved_gives_one_clear_line(monkeypatch, tmp_path):
