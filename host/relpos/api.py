@@ -160,7 +160,7 @@ def report(
 
 
 def bound(run: Run) -> Bound | None:
-    """Compute the Cramer-Rao bound of a simulated run, over time; None of a recorded one."""
+    """Compute the Cramer-Rao bound of a simulated run with known starts, over time; else None."""
     from relpos.evaluation import scoring
 
     return scoring.bound_of(run)

@@ -60,6 +60,13 @@ def test_a_result_written_and_read_scores_the_same(
     assert "relative distance RMSE" in str(here)
 
 
+def test_a_run_whose_starts_are_unknown_has_no_bound() -> None:
+    """It would be hundreds of metres, which every estimator beats, by what stands for unknown."""
+    for start in ("unknown", "position", "heading"):
+        assert relpos.bound(relpos.simulate("paper-p1", 3, seconds=20, start=start)) is None
+    assert relpos.bound(relpos.simulate("paper-p1", 3, seconds=20, start="known")) is not None
+
+
 def test_frames_are_tables_of_pandas(result: relpos.Result) -> None:
     pandas = pytest.importorskip("pandas")
     poses = result.frame()

@@ -283,6 +283,14 @@ def test_an_unknown_start_is_found_and_the_frame_does_not_matter() -> None:
     assert (known.filtering_position_m <= one.filtering_position_m + 1e-6).all()
 
 
+def test_ranges_tell_two_who_stand_at_one_place_how_near_they_are() -> None:
+    """Six people start at one corner, believed metres apart; two leave it within ten seconds."""
+    bound = bounds.of_simulated("paper-p1", 20000, {"start_shift_m": 4, "seconds": 20})
+    assert bound.filtering_distance_m[0] == pytest.approx(4.0, abs=0.01)
+    assert bound.filtering_distance_m[9] < 0.2
+    assert (bound.filtering_pair_m[9:] < 0.5).all()
+
+
 def _reordered(scene: TrueRun, order: list[int]) -> dict[str, npt.NDArray[np.generic]]:
     place = np.argsort(order)
     fields = (

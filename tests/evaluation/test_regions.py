@@ -69,6 +69,40 @@ def test_the_frame_is_the_first_located_nodes_pose_without_priors():
         assert summary.coverage.share == share
 
 
+def test_a_truth_is_not_guessed_between_rows_far_apart():
+    """Two presses 400 s apart: nobody knows where the wearer was in between."""
+    presses = Track(np.array([1.0, 399.0]), np.array([6.0, -6.0]), np.zeros(2))
+    estimate = estimates(lambda t: [ellipse(t, 0, 1.0, 6.0, 0.0, 0.2)])
+    summary = regions.summarise(estimate, {2: presses}, RANGES, starts_known=True)
+    assert summary is not None
+    assert (summary.looks, summary.coverage.share) == (2, 0.5)
+
+
+def test_the_order_of_the_rows_of_truth_does_not_matter():
+    x_m, order = np.linspace(0.0, 40.0, SECONDS.size), np.random.default_rng(1).permutation(400)
+    rows = Track(SECONDS[order], x_m[order], np.zeros(400))
+    estimate = estimates(lambda t: [ellipse(t, 0, 1.0, 0.1003 * t, 0.0, 0.2)])
+    summary = regions.summarise(estimate, {2: rows}, RANGES, starts_known=True)
+    assert summary is not None
+    assert (summary.looks, summary.coverage.share) == (399, 1.0)
+
+
+def test_without_the_true_start_of_the_frames_node_nothing_is_said_of_regions():
+    """Neither another node nor a later pose says where the frame lies in the truth."""
+    begun = located(1)
+    later = NodeEstimate(3, 4.0, 0.0, 0.0, 0.01, 0.01, 0.0, 0.1, NodeStatus.OK)
+    estimate = [
+        Estimate(t, (begun, ambiguous(2), later) if t > 1.0 else (begun, ambiguous(2)), (),
+                 (ellipse(t, 0, 1.0, 1.0, 3.0, 0.2),))
+        for t in SECONDS[1:]
+    ]  # fmt: skip
+    others = {2: still(5.0, 8.0), 3: still(9.0, 5.0)}
+    assert regions.summarise(estimate, others, RANGES, starts_known=False) is None
+    late = Track(SECONDS[200:], 0.1 * SECONDS[200:], np.zeros(200), np.zeros(200))
+    with_late = {**others, 1: late}
+    assert regions.summarise(estimate, with_late, RANGES, starts_known=False) is None
+
+
 def test_a_rings_region_is_its_circumference_times_its_width():
     truth = {1: still(0.0, 0.0), 2: still(0.0, -5.0)}
     ring = estimates(

@@ -45,7 +45,8 @@ UNKNOWN_RAD = 10.0
 it, and small enough that no digits are lost against the centimetres."""
 
 TOGETHER_M = 1e-6
-"""Nearer than this two nodes stand at one place, and their distance has no derivative."""
+"""Nearer than this two nodes stand at one place, and their distance has no derivative: a range
+then counts by the mean of its information over all directions, half of it along each axis."""
 
 
 @dataclass(frozen=True)
@@ -286,16 +287,16 @@ class _System:
             before, after = true_run.position_m[:, step], true_run.position_m[:, step + 1]
             apart = (1.0 - share) * (before[i] - before[j]) + share * (after[i] - after[j])
             distance = math.hypot(*apart)
-            if distance < TOGETHER_M:
-                continue
-            row = np.zeros(self._size)
-            for node, sign in ((i, 1.0), (j, -1.0)):
-                column = self._column[node]
-                row[column[:2]] += sign * share * apart / distance
-                if share < 1.0:
-                    row[column[_OLD_X:]] += sign * (1.0 - share) * apart / distance
-            rows.append(row)
-            information.append(true_run.range_information[index])
+            units = np.eye(2) if distance < TOGETHER_M else [apart / distance]
+            for unit in units:
+                row = np.zeros(self._size)
+                for node, sign in ((i, 1.0), (j, -1.0)):
+                    column = self._column[node]
+                    row[column[:2]] += sign * share * unit
+                    if share < 1.0:
+                        row[column[_OLD_X:]] += sign * (1.0 - share) * unit
+                rows.append(row)
+                information.append(true_run.range_information[index] / len(units))
         return np.array(rows).reshape(-1, self._size), np.array(information)
 
     def positions(self, covariances: Floats) -> Floats:

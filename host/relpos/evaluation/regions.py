@@ -18,7 +18,7 @@ import numpy.typing as npt
 from relpos.evaluation.consistency import Coverage, coverage
 from relpos.fusion.estimator import Alternative, Estimate, NodeStatus, Shape
 from relpos.measurements import Range
-from relpos.tracks import UNMOVED, Alignment, Track
+from relpos.tracks import UNMOVED, Alignment, Track, sample
 
 Floats = npt.NDArray[np.float64]
 
@@ -57,18 +57,20 @@ def into_frame_of(estimates: Iterable[Estimate], truth: Mapping[int, Track]) -> 
     """Motion of the truth into the frame of an estimate without priors.
 
     That is the first located node's true pose at the start. None where no node was located or that
-    node's truth has no heading.
+    pose is not known.
     """
     for estimate in estimates:
         for node in estimate.nodes:
-            if node.status is NodeStatus.OK and node.node in truth:
-                track = truth[node.node]
-                heading = float(np.interp(0.0, track.time_s, np.unwrap(track.heading_rad)))
+            if node.status is NodeStatus.OK:
+                track = truth.get(node.node)
+                begin_s = 0.0 if track is None else np.min(track.time_s, initial=math.inf)
+                if track is None or begin_s > estimate.time_s:
+                    return None
+                position_m, [[heading]] = sample([track], np.array([max(begin_s, 0.0)]))
                 if not math.isfinite(heading):
                     return None
-                origin_m = [np.interp(0.0, track.time_s, c) for c in (track.x_m, track.y_m)]
                 return Alignment(
-                    math.cos(heading), -math.sin(heading), np.array(origin_m), np.zeros(2)
+                    math.cos(heading), -math.sin(heading), position_m[0, 0], np.zeros(2)
                 )
     return None
 
@@ -84,11 +86,11 @@ def look(estimate: Estimate, truth: Mapping[int, Track], moving: Alignment) -> l
         track = truth.get(node.node)
         if node.status is not NodeStatus.AMBIGUOUS or not own or track is None:
             continue
-        if not track.time_s[0] <= estimate.time_s <= track.time_s[-1]:
+        there_m = sample([track], np.array([estimate.time_s]))[0][0]
+        if not np.isfinite(there_m).all():
             continue
         region = Region.of(own, SHARE, DRAWS)
-        there_m = [np.interp(estimate.time_s, track.time_s, c) for c in (track.x_m, track.y_m)]
-        holds = region.contains(*moving(np.array([there_m]))[0])
+        holds = region.contains(*moving(there_m)[0])
         looks.append(
             Look(estimate.time_s, node.node, holds, region.area_m2, own[0].shape is Shape.RING)
         )

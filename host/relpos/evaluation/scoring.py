@@ -151,15 +151,19 @@ def _common(run: Run, priors: Sequence[Prior]) -> bool:
 
 
 def bound_of(run: Run) -> Bound | None:
-    """Compute the Cramer-Rao bound of a simulated run; None for other runs."""
+    """Compute the Cramer-Rao bound of a simulated run; None for other runs.
+
+    None where a start is unknown: the first errors may then be as large as one likes.
+    """
     made = run.description.simulated
     if made is None:
         return None
     # Not for what was recorded: the simulations take half a second to import.
     from relpos.evaluation import bounds
+    from relpos.simulation.paper import Start
     from relpos.simulation.scenarios import BOUNDED
 
-    if made.scenario not in BOUNDED:
+    if made.scenario not in BOUNDED or made.settings.get("start", Start.KNOWN) != Start.KNOWN:
         return None
     return bounds.of_simulated(made.scenario, made.seed, made.settings)
 

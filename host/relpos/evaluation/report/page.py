@@ -184,7 +184,7 @@ def _in_short(content: Content) -> list[str]:
         if content.bound is not None:
             totals = content.bound.totals()
             least, _ = totals.of(smoothed=result.smoothed)
-            sentence += f", and no estimator can be expected below {least:.2f} m"
+            sentence += f"; the Cramer-Rao bound of the ranges that arrived is {least:.2f} m"
         words.append(sentence + ".")
         nees = scored.nees_distance
         if nees.values:
