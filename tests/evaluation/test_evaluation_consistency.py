@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from relpos.evaluation import consistency
+from relpos.evaluation import consistency, metrics
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
-from relpos.tracks import Track
+from relpos.tracks import PairTrack, Track
 
 Floats = npt.NDArray[np.float64]
 
@@ -65,6 +65,22 @@ def test_missing_values_are_left_out() -> None:
     one = consistency.nees([np.array([[1.0, np.nan], [3.0, 5.0]] * 20)])
     assert one.mean == pytest.approx(2.5)
     assert one.values == 60
+
+
+def test_the_nees_of_distances_has_the_mean_that_the_run_format_gives() -> None:
+    """Also where a third node comes late, and what is said of it errs more."""
+    early, late = np.arange(100.0), np.arange(90.0, 100.0)
+    truth = {n: Track(t, 0.0 * t, n + 0.0 * t) for n, t in ((1, early), (2, early), (3, late))}
+    pairs = {
+        (1, 2): PairTrack(early, 1.0 + np.resize([0.5, 1.0], 100), 1.0 + 0.0 * early),
+        (1, 3): PairTrack(late, 5.0 + 0.0 * late, 1.0 + 0.0 * late),
+        (2, 3): PairTrack(late[2:], 4.0 + 0.0 * late[2:], 1.0 + 0.0 * late[2:]),
+    }
+    one = metrics.evaluate(truth, truth, pairs)
+    assert one.nees_distance == pytest.approx((62.5 + 18 * 9.0) / 118)
+    assert consistency.of_distances([one]).mean == pytest.approx(one.nees_distance)
+    without = metrics.evaluate(truth, truth)
+    assert math.isnan(consistency.of_distances([without]).mean)
 
 
 def _estimate(time_s: float, x: float, y: float, heading: float, sigma: float) -> Estimate:

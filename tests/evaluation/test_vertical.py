@@ -142,6 +142,11 @@ def test_a_flight_is_found_late_but_not_in_the_wrong_direction(begin_s, word, fo
     assert result.false_flights_h == pytest.approx(false / (3 * 41 / 3600.0))
 
 
+def test_false_flights_are_counted_over_the_time_that_has_an_estimate() -> None:
+    stated = estimates(episode=lambda n, t: "down" if 5.0 <= t < 8.0 else "level")
+    assert scored(stated[:11]).false_flights_h == pytest.approx(3600.0 / 13.0), "and 2 s more"
+
+
 def test_the_way_on_flights_is_estimated_over_true() -> None:
     assert scored(estimates()).stairs_way == pytest.approx(1.0)
     assert scored(estimates(stretch=2.0)).stairs_way == pytest.approx(2.0)

@@ -87,8 +87,16 @@ def chi_square_interval(freedom: float) -> tuple[float, float]:
 
 
 def of_distances(metrics: Sequence[Metrics]) -> Nees:
-    """NEES of the pairs' distances over runs, all epochs of the run format's figure."""
-    return nees([one.nees_over_time for one in metrics])
+    """NEES of the pairs' distances over runs: of each run its figure of the run format.
+
+    There every square counts alike, so an epoch counts by its number of pairs.
+    """
+    runs = []
+    for one in metrics:
+        pairs = np.isfinite(one.pair_nees).sum(axis=1)
+        weight = pairs * np.count_nonzero(pairs) / max(pairs.sum(), 1)
+        runs.append(one.nees_distance + weight * (one.nees_over_time - one.nees_distance))
+    return nees(runs)
 
 
 def of_poses(estimates: Sequence[Estimate], truth: Mapping[int, Track]) -> tuple[Floats, Floats]:

@@ -85,6 +85,7 @@ class Metrics:
     pair_ids: tuple[Pair, ...]
     pair_distance_m: Floats
     pair_true_distance_m: Floats
+    pair_nees: Floats
     nees_left_out: int = 0
     ok_over_3_sigma: float = math.nan
     ok_over_2_m: float = math.nan
@@ -183,6 +184,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],
         pair_true_distance_m=true_m[scored],
+        pair_nees=nees[scored],
         ok_over_3_sigma=_share_above(nees[relied_on], 3.0**2),
         ok_over_2_m=_share_above(np.abs(error_m[relied_on]), 2.0),
         ok_wrong_side=share_on_wrong_side(

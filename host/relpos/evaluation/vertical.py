@@ -55,9 +55,9 @@ class Vertical:
     often the floor nearest to the estimated height is the true one, off stairs; ``floor_right``
     the same of the floor that is stated, none counted as wrong; ``wrong_claimed`` the share of all
     node-seconds in which a floor is claimed that is not there. ``stairs_way`` is the way on
-    flights, estimated over true. ``false_flights_h`` are per hour of one wearer. ``fall_error_m``
-    is the largest height error three seconds after a fall. ``not_scored`` says what the estimate
-    or the run has nothing for.
+    flights, estimated over true. ``false_flights_h`` are per hour of one wearer with an estimate.
+    ``fall_error_m`` is the largest height error three seconds after a fall. ``not_scored`` says
+    what the estimate or the run has nothing for.
     """
 
     seconds: int
@@ -309,7 +309,7 @@ def _with_flights(found: Vertical, nodes: Mapping[int, _Node], *, stated: bool) 
     surplus_m = way_m = hours = 0.0
     falls = [math.nan]
     for n in nodes.values():
-        hours += n.time_s.size / 3600.0
+        hours += np.isfinite(n.sigma_z_m).sum() / 3600.0
         for begin_s, end_s, word in n.spans:
             inside = (n.time_s >= begin_s) & (n.time_s <= end_s + LAG_S)
             hit = int(((n.episode == word) & inside).sum()) >= FOUND_S
