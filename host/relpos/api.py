@@ -17,22 +17,25 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from relpos import sources
 from relpos.errors import FusionInterrupted, RelposError
 from relpos.evaluation.result import Result, read_result, result_of, run_estimator
 from relpos.evaluation.scoring import Evaluation
 from relpos.fusion.estimator import Estimate, Estimator, Progress
-from relpos.measurements import Measurement, Prior
+from relpos.measurements import Measurement, Prior, out_of_bounds
 from relpos.runs import InitialPose, Run, save_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from relpos.evaluation.bounds import Bound
+
+T = TypeVar("T")
 
 Given = str | Estimator | Callable[..., Estimator]
 """An estimator as ``fuse`` takes it: a name, an object, or a class or function that makes one."""
@@ -48,6 +51,7 @@ def load(path: Path | str) -> Run:
 
 def save(run: Run, path: Path | str) -> None:
     """Write a run as a run directory that :func:`load` reads back to the same run."""
+    _check_run(run)
     save_run(run, path)
 
 
@@ -99,9 +103,8 @@ def fuse(
     if isinstance(estimator, str):
         _compile(estimator, settings, progress)
     made = _make(estimator, name, run, priors, settings, seed, smooth=smooth)
-    estimator_run = run_estimator(
-        made, run.measurements if measurements is None else measurements, progress
-    )
+    arrived = run.measurements if measurements is None else tuple(measurements)
+    estimator_run = run_estimator(made, arrived, progress)
     result = result_of(
         name, estimator_run, seed=seed, settings=settings, priors=priors, smoothed=smooth
     )
@@ -163,6 +166,7 @@ def bound(run: Run) -> Bound | None:
     """Compute the Cramer-Rao bound of a simulated run with known starts, over time; else None."""
     from relpos.evaluation import scoring
 
+    _check_run(run)
     return scoring.bound_of(run)
 
 
@@ -178,12 +182,10 @@ def priors_of(run: Run, initial: str | Sequence[Prior] | None = None) -> tuple[P
     if initial is None:
         return run.priors
     if not isinstance(initial, str):
-        for p in initial:
-            if not all(map(math.isfinite, (p.x_m, p.y_m, p.heading_rad))):
-                raise RelposError(f"initial: the pose of node {p.node} is not finite")
-            if not (p.sigma_m >= 0.0 and p.sigma_rad >= 0.0):
-                raise RelposError(f"initial: a sigma of node {p.node} is negative")
-        return tuple(initial)
+        given = _listed("initial", initial, Prior)
+        for prior in given:
+            _check_prior(prior)
+        return given
     words = {
         "unknown": InitialPose.UNKNOWN,
         "common": InitialPose.COMMON,
@@ -192,6 +194,33 @@ def priors_of(run: Run, initial: str | Sequence[Prior] | None = None) -> tuple[P
     if initial not in words:
         raise RelposError(f"initial: '{initial}' is none of {', '.join(words)}")
     return run.priors_for(words[initial])
+
+
+def _check_prior(prior: Prior) -> None:
+    node = prior.node
+    # An infinite sigma is one that is not known.
+    sigma_m, sigma_rad = (0.0 if s == math.inf else s for s in (prior.sigma_m, prior.sigma_rad))
+    try:
+        if not 0 <= node == node // 1:
+            raise RelposError(f"initial: {node!r} is no node id")
+        if not all(map(math.isfinite, (prior.x_m, prior.y_m, prior.heading_rad))):
+            raise RelposError(f"initial: the pose of node {node} is not finite")
+        if not (sigma_m >= 0.0 and sigma_rad >= 0.0):
+            raise RelposError(f"initial: a sigma of node {node} is negative")
+        beyond = out_of_bounds(replace(prior, sigma_m=sigma_m, sigma_rad=sigma_rad))
+    except TypeError:
+        raise RelposError(f"initial: something else than a number in {prior}") from None
+    if beyond is not None:
+        raise RelposError(f"initial: {beyond} of node {node} is beyond its bounds")
+
+
+def _listed(name: str, given: Iterable[T], kind: type[T]) -> tuple[T, ...]:
+    """Return what may be a generator as a tuple; RelposError where anything else is in it."""
+    listed = tuple(given) if isinstance(given, Iterable) else (given,)
+    for one in listed:
+        if not isinstance(one, kind):
+            raise RelposError(f"{name}: {type(one).__name__}, not a relpos.{kind.__name__}")
+    return listed
 
 
 def _check_run(run: Run) -> None:
@@ -256,7 +285,7 @@ def _result(given: Result | Sequence[Estimate] | Path | str) -> Result:
         return given
     if isinstance(given, str | Path):
         return read_result(given)
-    return Result("estimates", tuple(given))
+    return Result("estimates", _listed("result", given, Estimate))
 
 
 __all__ = ["bound", "evaluate", "fuse", "load", "plot", "report", "save", "simulate"]

@@ -208,18 +208,24 @@ files refuse what is beyond, estimators count it (``beyond_bounds``); docs/run-f
 LEAST_SIGMA = 1e-6
 """Least standard deviation (m, rad) of a measurement above 0, which means that it is not stated."""
 
-_bounded_fields: dict[type, tuple[tuple[str, float, float], ...]] = {}
+_bounded_fields: dict[type, tuple[tuple[str, float, float, bool], ...]] = {}
 
 
-def out_of_bounds(row: Observation | Truth) -> str | None:
-    """Return the first field that is beyond its bounds, or no finite number; None where all fit."""
+def out_of_bounds(row: Observation | Truth | Prior) -> str | None:
+    """Return the first field that is beyond its bounds, or no finite number; None where all fit.
+
+    TypeError where one is no number at all.
+    """
     kind = type(row)
     if kind not in _bounded_fields:
-        names = (field.name for field in fields(kind))
-        _bounded_fields[kind] = tuple((name, *BOUNDS[name]) for name in names if name in BOUNDS)
-    for name, low, high in _bounded_fields[kind]:
+        _bounded_fields[kind] = tuple(
+            (one.name, *BOUNDS[one.name], one.default is None)
+            for one in fields(kind)
+            if one.name in BOUNDS and one.type != "str"
+        )
+    for name, low, high, optional in _bounded_fields[kind]:
         value = getattr(row, name)
-        if value is None or isinstance(value, str):
+        if value is None and optional:
             continue
         if not low <= value <= high or (0.0 < value < LEAST_SIGMA and name.startswith("sigma")):
             return name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,8 +130,6 @@ def test_latency_is_what_the_estimator_waits_in_the_runs_time(
 
 
 def test_a_run_without_truth_cannot_be_scored(run: relpos.Run, result: relpos.Result) -> None:
-    from dataclasses import replace
-
     with pytest.raises(relpos.DataError, match="no truth"):
         relpos.evaluate(result, replace(run, truth=()))
 
@@ -158,12 +157,16 @@ def test_what_is_no_estimator_is_refused(run: relpos.Run, estimator: Any) -> Non
         relpos.fuse(run, estimator)
 
 
-def test_a_path_in_place_of_a_run_is_refused(result: relpos.Result) -> None:
+def test_a_path_in_place_of_a_run_is_refused(result: relpos.Result, tmp_path: Path) -> None:
     path: Any = "walk"
     with pytest.raises(relpos.RelposError, match="load reads one"):
         relpos.fuse(path)
     with pytest.raises(relpos.RelposError, match="load reads one"):
         relpos.evaluate(result, path)
+    with pytest.raises(relpos.RelposError, match="load reads one"):
+        relpos.bound(path)
+    with pytest.raises(relpos.RelposError, match="load reads one"):
+        relpos.save(path, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +174,11 @@ def test_a_path_in_place_of_a_run_is_refused(result: relpos.Result) -> None:
     [
         (relpos.Prior(1, math.nan, 0.0, 0.0), "node 1 is not finite"),
         (relpos.Prior(1, 0.0, 0.0, 0.0, -1.0), "sigma of node 1 is negative"),
+        (relpos.Prior(1, 1e300, 0.0, 0.0), "x_m of node 1 is beyond its bounds"),
+        (relpos.Prior(-1, 0.0, 0.0, 0.0), "-1 is no node id"),
+        (relpos.Prior("1", 0.0, 0.0, 0.0), "something else than a number"),  # type: ignore[arg-type]
+        (relpos.Prior(1, None, 0.0, 0.0), "something else than a number"),  # type: ignore[arg-type]
+        ((1, 0.0, 0.0, 0.0), "tuple, not a relpos.Prior"),
     ],
 )
 def test_a_start_that_cannot_be_is_refused(
@@ -184,3 +192,28 @@ def test_settings_that_are_no_mapping_are_refused(run: relpos.Run) -> None:
     text: Any = "hypotheses=1"
     with pytest.raises(relpos.RelposError, match="settings: "):
         relpos.fuse(run, settings=text)
+
+
+def test_starts_and_measurements_may_come_from_a_generator(run: relpos.Run) -> None:
+    given = relpos.fuse(run, "deadreckoning", initial=run.priors)
+    assert relpos.fuse(run, "deadreckoning", initial=(p for p in run.priors)) == given
+    assert relpos.fuse(run, "deadreckoning", measurements=iter(run.measurements)) == given
+
+
+def test_results_of_the_same_estimates_are_equal(run: relpos.Run, result: relpos.Result) -> None:
+    assert relpos.fuse(run, "particle", seed=1, settings={"particles": 50}) == result
+    assert relpos.fuse(run, "particle", seed=2, settings={"particles": 50}) != result
+
+
+@pytest.mark.parametrize("given", [None, 3, [1]])
+def test_what_is_no_result_is_refused(run: relpos.Run, given: Any) -> None:
+    with pytest.raises(relpos.RelposError, match=r"not a relpos\.Estimate"):
+        relpos.evaluate(given, run)
+
+
+def test_a_number_that_cannot_be_read_back_is_not_saved(run: relpos.Run, tmp_path: Path) -> None:
+    relpos.save(run, tmp_path)
+    unknown = replace(run.motions[0], sigma_x_m=math.nan)
+    with pytest.raises(relpos.DataError, match="sigma_x_m cannot be read back"):
+        relpos.save(replace(run, measurements=(unknown,)), tmp_path)
+    assert relpos.load(tmp_path).measurements == run.measurements

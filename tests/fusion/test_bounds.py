@@ -11,13 +11,17 @@ import pytest
 from relpos import fusion
 from relpos.errors import DataError
 from relpos.fusion.estimator import NodeStatus
+from relpos.fusion.switching import SwitchingEstimator
 from relpos.fusion.timeline import refusal
 from relpos.measurements import (
     BOUNDS,
     Heading,
     Height,
     Motion,
+    Prior,
     Range,
+    Status,
+    Truth,
     common_priors,
     out_of_bounds,
 )
@@ -44,6 +48,45 @@ def test_a_value_beyond_its_bounds_is_refused_and_one_at_them_is_not(row, name):
     for none in (math.nan, math.inf, -math.inf):
         with pytest.raises(DataError, match="not a finite number"):
             refusal(replace(row, **{name: none}))
+
+
+NO_MEASUREMENTS = [
+    Truth(1.0, 1, 0.0, 0.0),
+    Status(1.0, 1, "battery_v", 9.0),
+    (1.0, 1, 2, 4.0),
+    replace(RANGE, range_m=None),
+    replace(RANGE, range_m="4"),
+    replace(RANGE, time_s=None),
+    replace(RANGE, node="1"),
+    replace(RANGE, node=math.nan),
+    replace(RANGE, node=1.5),
+    replace(RANGE, peer=-1),
+    replace(MOTION, dx_m=None),
+]
+
+
+@pytest.mark.parametrize("name", ["bank", "particle", "deadreckoning"])
+@pytest.mark.parametrize("row", NO_MEASUREMENTS)
+def test_what_is_no_measurement_is_refused_at_once_and_leaves_no_trace(name, row):
+    priors, one = [Prior(1, 0.0, 0.0, 0.0)], Motion(1.0, 1, 0.7, 0.0, 0.1)
+    estimator, other = (fusion.make(name, priors) for _ in range(2))
+    for before in (estimator, other):
+        before.process(one)
+    with pytest.raises(DataError, match=re.escape(repr(row))):
+        estimator.process(row)
+    for time_s in (2.0, 3.0):
+        later = replace(one, time_s=time_s)
+        assert estimator.process(later) == other.process(later)
+    assert estimator.counters() == other.counters()
+
+
+def test_a_refused_time_lets_the_default_estimator_remember_no_more_than_else():
+    estimator = fusion.make("bank")
+    assert isinstance(estimator, SwitchingEstimator)
+    estimator.process(replace(RANGE, time_s=1e7))
+    for second in range(1, 200):
+        estimator.process(replace(MOTION, time_s=float(second)))
+    assert len(estimator._recent) < 100
 
 
 def test_the_page_of_the_run_format_has_every_bound():

@@ -142,7 +142,7 @@ class Result:
     settings: Mapping[str, object] = field(default_factory=dict)
     priors: tuple[Prior, ...] | None = None
     smoothed: bool = False
-    estimator_run: EstimatorRun | None = None
+    estimator_run: EstimatorRun | None = field(default=None, compare=False)
 
     @property
     def latency(self) -> Latency | None:

@@ -25,7 +25,7 @@ from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Core, Rewinder
-from relpos.fusion.timeline import Displacement, Timeline
+from relpos.fusion.timeline import Displacement, Timeline, refusal
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 LARGE_TEAM = 20
@@ -100,7 +100,7 @@ class SwitchingEstimator:
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
-        if isinstance(self.estimator.core, LargeTeam):
+        if isinstance(self.estimator.core, LargeTeam) or refusal(measurement) is not None:
             return self.estimator.process(measurement)
         recent, time_s = self._recent, measurement.time_s
         recent.append(measurement)

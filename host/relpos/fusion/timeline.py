@@ -145,9 +145,19 @@ class _Track:
 def refusal(measurement: Measurement) -> str | None:
     """Say why no estimator can use a measurement, as a counter's name; None where it can.
 
-    DataError where a number is not finite: that is no failure of a sensor but of the source.
+    DataError where it is none, or a number is not finite: that is no failure of a sensor but of
+    the source.
     """
-    name = out_of_bounds(measurement)
+    if type(measurement) not in MEASUREMENTS:
+        kinds = ", ".join(kind.__name__ for kind in MEASUREMENTS)
+        raise DataError(f"{measurement!r} is no measurement: one of {kinds}")
+    try:
+        for node in (measurement.node, getattr(measurement, "peer", 0)):
+            if not 0 <= node == node // 1:
+                raise DataError(f"{node} is no node id: {measurement}")
+        name = out_of_bounds(measurement)
+    except TypeError:
+        raise DataError(f"a measurement has something else than a number: {measurement}") from None
     if name is not None:
         if not isfinite(getattr(measurement, name)):
             raise DataError(f"a measurement is not a finite number: {measurement}")

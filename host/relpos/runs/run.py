@@ -28,6 +28,7 @@ from relpos.measurements import (
     Step,
     Truth,
     common_priors,
+    out_of_bounds,
 )
 from relpos.runs.appending import AppendedTable, close_all, write_rows
 from relpos.runs.description import (
@@ -257,14 +258,18 @@ def save_run(run: Run, path: Path | str) -> None:
     """Write a run directory that :func:`load_run` reads back to the same run.
 
     A table that the run has nothing for is not written, and not left of a run that was there;
-    ``imu.csv`` is copied through.
+    ``imu.csv`` is copied through. DataError, before anything is written, where a row has a number
+    that could not be read back.
     """
     directory = Path(path)
     imu = run.load_imu()
+    by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
+    for row in chain.from_iterable(by_kind.values()):
+        if name := out_of_bounds(row):
+            raise DataError(f"{directory}: not written: {name} cannot be read back: {row}")
     directory.mkdir(parents=True, exist_ok=True)
     description = replace(run.description, name=run.name)
     write_description(directory / "run.toml", description)
-    by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
     for table in _TABLES:
         remove_table(directory, table.name)
         if rows := by_kind[table.kind]:

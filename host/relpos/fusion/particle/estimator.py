@@ -73,10 +73,11 @@ class ParticleFilter:
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
+        steps = self._timeline.push(measurement)
         self._meet(measurement.node)
         if isinstance(measurement, Range):
             self._meet(measurement.peer)
-        return self._work_off(self._timeline.push(measurement))
+        return self._work_off(steps)
 
     def finish(self) -> list[Estimate]:
         """Process what waits; RelposError if the run cannot give relative positions."""

@@ -86,8 +86,8 @@ class Smoother:
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; nothing is known for sure before the end."""
-        self._measurements.append(measurement)
         self._estimates += self.online.process(measurement)
+        self._measurements.append(measurement)
         return []
 
     def finish(self) -> list[Estimate]:
