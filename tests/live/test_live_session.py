@@ -5,6 +5,7 @@ import math
 import os
 import pty
 import threading
+import time
 
 import pytest
 from team_input import Album, TeamInput, make_session, run_through
@@ -148,6 +149,20 @@ def test_a_port_that_is_gone_is_reported_and_makes_no_node_lost():
     everyone = [person for p in album.views for person in p.people]
     assert not [person for person in everyone if person.alert is Alert.LOST]
     assert {person.status for person in back[-1].people} == {"ok"}
+
+
+def test_a_laptop_whose_clock_is_set_while_nothing_arrives_hides_no_silence(monkeypatch):
+    now_s = time.time
+    with EmulatedTeam(TeamConfig("straight", 2, 20.0, 5, beacons=True)) as team:
+        source = TeamInput(team)
+        source.unplug(10.0, 10.0)
+        monkeypatch.setattr(time, "time", lambda: now_s() - 3600.0 * (source.now_s() > 12.0))
+        session, album = make_session(source, deadreckoning, priors=team.priors())
+        run_through(session)
+    silent = [view for view in album.views if 13.0 < view.time_s < 19.0]
+    ages_s = [view.unix_s - view.arrived_unix_s for view in silent]
+    assert ages_s == sorted(ages_s)
+    assert 0.0 < ages_s[0] < ages_s[-1] < 300.0
 
 
 class Slow:

@@ -23,6 +23,7 @@ from relpos.fusion.clocks import time_offsets
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.live.alarms import CLEARED, RAISED, KnownAlert
 from relpos.live.board import BOARD_EVENTS, Board, BoardError
+from relpos.live.clock import SessionClock
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
@@ -106,7 +107,8 @@ class LiveSession:
         self._handler = RequestHandler(lambda unix_s: source.now_s() - (time.time() - unix_s))
         self._notices = NoticeBoard(source.now_s)
         self._stopped = threading.Event()
-        self._arrived_unix_s: float | None = None
+        self._clock = SessionClock()
+        self._arrived_s: float | None = None
         self._viewed_s = -math.inf
         self._changed = False
         """Whether the view has changed since it was last shown."""
@@ -224,7 +226,7 @@ class LiveSession:
 
     def _add(self, received: Received) -> None:
         now_s = self._source.now_s()
-        self._arrived_unix_s = time.time()
+        self._arrived_s = self._clock()
         self.outcome.received += len(received.observations)
         if received.again:
             # What was between the sessions is no sleep.
@@ -420,8 +422,11 @@ class LiveSession:
         self._changed = False
         self._viewed_s = self._pace()
         with self._surviving("view"):
+            unix_s, arrived_s = time.time(), self._arrived_s
+            # By a clock that nobody sets: else one that is set back makes silence look like news.
+            arrived_unix_s = None if arrived_s is None else unix_s - (self._clock() - arrived_s)
             view = self._composer.view(
-                self._source.now_s(), time.time(), self._arrived_unix_s, self._notices.all()
+                self._source.now_s(), unix_s, arrived_unix_s, self._notices.all()
             )
             self._feed(lambda sink: sink.updated(view))
 
