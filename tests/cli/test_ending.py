@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+import relpos
 from relpos.cli import fuse, live
 from relpos.live.session import Outcome
 
@@ -41,3 +44,16 @@ def test_a_second_ctrl_c_leaves_the_debrief_for_later(
     fuse.fuse_live(job, TEAM, live.Options(view=True), as_json=False)
     said = capsys.readouterr().err
     assert f"relpos report {tmp_path / 'received'} --estimate {tmp_path}" in said
+
+
+def test_closed_outputs_are_no_traceback(tmp_path: Path) -> None:
+    run, folder = relpos.simulate("paper", 1, seconds=10), str(tmp_path)
+    relpos.save(run, folder)
+    relpos.fuse(run, "deadreckoning").save(folder)
+    command = [sys.executable, "-m", "relpos", "evaluate", folder, "--estimate", folder]
+    no_stdout = subprocess.run(
+        ["sh", "-c", 'exec "$@" >&-', "sh", *command], stderr=subprocess.PIPE, text=True
+    )
+    assert (no_stdout.returncode, no_stdout.stderr) == (0, "")
+    neither = subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command])
+    assert neither.returncode == 0
