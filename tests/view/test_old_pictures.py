@@ -23,6 +23,15 @@ SLOW = """window.agesS = []; const Real = WebSocket;
             });
         }
     };"""
+COUNTED = """window.pictures = 0; const Real = WebSocket;
+    window.WebSocket = class extends Real {
+        constructor(address) {
+            super(address);
+            this.addEventListener("message", ({ data }) => {
+                window.pictures += data.startsWith('{"type":"picture"');
+            });
+        }
+    };"""
 # A network in which every message takes three seconds.
 FAR = """const Real = WebSocket;
     window.WebSocket = class extends Real {
@@ -121,3 +130,18 @@ def test_times_on_the_board_are_the_sessions_and_not_a_wrong_clocks(
     wait_live(page)
     stage.set_board({"kind": "rollcall", "action": "start", "nodes": [1, 2], "within_s": 900})
     expect(page.locator("#roll-line")).to_contain_text(re.compile(r"1[45]:\d\d.min left"))
+
+
+def test_a_phone_asks_for_few_pictures_and_the_team_s_page_for_all(
+    visit: Any, stage: Stage
+) -> None:
+    counts = []
+    for path in ("/phone", "/"):
+        page = visit(path, init=COUNTED)
+        wait_live(page)
+        page.evaluate("window.pictures = 0")
+        page.wait_for_timeout(4000)
+        counts.append(page.evaluate("window.pictures") / 4.0)
+        page.close()
+    phone, team = counts
+    assert 1.0 < phone <= 4.0 < team, counts

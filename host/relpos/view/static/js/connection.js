@@ -8,10 +8,11 @@ const TICK_MS = 500;
 /**
  * `onMessage(object, ageS)` gets every message, and how old it is at most; `onState(state)` every change of it: "connecting",
  * "live", "silent" (connected, but nothing comes), "waiting" (until the next attempt) or "refused"
- * (the server does not know our token).
+ * (the server does not know our token). A picture is asked for `restMs` after the last one: one air carries all phones.
  */
 export class Connection {
-  constructor({ onMessage, onState }) {
+  constructor({ onMessage, onState, restMs = 0 }) {
+    this.restMs = restMs;
     this.onMessage = onMessage;
     this.onState = onState;
     this.state = "connecting";
@@ -77,9 +78,14 @@ export class Connection {
       if (message.type === "you") this.askedFor = moment(sinceS(this.opened) + (message.view_age_s ?? 0));
       this.onMessage(message, sinceS(this.askedFor));
       if (message.type !== "picture") return;
-      // The next one is made after this word: no older than the time since.
-      this.askedFor = moment();
-      if (socket.readyState === WebSocket.OPEN) socket.send("");
+      const ask = () => {
+        if (socket !== this.socket || socket.readyState !== WebSocket.OPEN) return;
+        // The next one is made after this word: no older than the time since.
+        this.askedFor = moment();
+        socket.send("");
+      };
+      if (this.restMs) setTimeout(ask, this.restMs);
+      else ask();
     };
     socket.onclose = () => {
       if (socket === this.socket) this.fail();

@@ -61,6 +61,7 @@ const sharing = new CompassSharing(showCompass);
 const findView = new FindView(byId("find"), { close: stopFinding, next: findNext });
 const connection = new Connection({
   onMessage: handle,
+  restMs: LIST_MS,
   onState: (state) => {
     showAge();
     if (state === "live") {
