@@ -251,6 +251,49 @@ def test_a_lost_member_stays_on_the_map_as_a_marker_until_it_is_heard_again(
     assert "test.1-last" not in due(schedule, team_view(5), 66.0)
 
 
+GONE = {1: {"status": "lost", "seen_s": 60.0, "alert": Alert.LOST}}
+
+
+def test_the_marker_goes_also_where_who_is_heard_again_has_no_position(schedule: Schedule) -> None:
+    due(schedule, team_view(1, changes=GONE), 0.0)
+    nowhere = {1: {"status": "unlocated", "x_m": None, "y_m": None}}
+    assert due(schedule, team_view(2, changes=nowhere), 2.0)["test.1-last"].type == "t-x-d-d"
+
+
+def test_a_lost_member_has_its_marker_as_soon_as_it_has_a_position(schedule: Schedule) -> None:
+    nowhere = {1: {**GONE[1], "x_m": None, "y_m": None}}
+    assert "test.1-last" not in due(schedule, team_view(1, changes=nowhere), 0.0)
+    assert "test.1-last" in due(schedule, team_view(2, changes=GONE), 2.0)
+
+
+def test_the_ends_of_alarms_and_markers_are_told_thrice_and_after_each_broken_connection(
+    schedule: Schedule,
+) -> None:
+    still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
+    due(schedule, team_view(1, changes={**GONE, 3: still}), 0.0)
+
+    def ends(seconds: range) -> list[tuple[int, str]]:
+        return [
+            (second, event.type)
+            for second in seconds
+            for event in due(schedule, team_view(second), float(second)).values()
+            if event.type in ("b-a-o-can", "t-x-d-d")
+        ]
+
+    thrice = [(s, kind) for s in (2, 12, 22) for kind in ("t-x-d-d", "b-a-o-can")]
+    assert ends(range(2, 100)) == thrice
+    schedule.again()
+    assert ends(range(100, 200))[:2] == [(100, "t-x-d-d"), (100, "b-a-o-can")]
+
+
+def test_an_alarm_is_told_at_once_to_a_server_that_is_back(schedule: Schedule) -> None:
+    still = {3: {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}}
+    due(schedule, team_view(1, changes=still), 0.0)
+    assert "test.3-9-1-1" not in due(schedule, team_view(2, changes=still), 2.0)
+    schedule.again()
+    assert "test.3-9-1-1" in due(schedule, team_view(3, changes=still), 4.0)
+
+
 @pytest.mark.soak  # `make soak` installs it
 def test_takproto_reads_members_alarms_markers_and_deletions(schedule: Schedule) -> None:
     takproto = pytest.importorskip("takproto", reason="make soak installs it")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import os
 import platform
 import threading
@@ -24,7 +25,7 @@ from relpos.errors import DataError
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import Estimate
 from relpos.geodesy import MapFrame, Pin, place
-from relpos.live.cot_events import Events, Moved, serialized
+from relpos.live.cot_events import Events, Moved, is_located, serialized
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Person, TeamView
 from relpos.said import Said
@@ -35,6 +36,9 @@ LOST_EVERY_S = 10.0
 """A lost member: often enough for a client that has just joined."""
 LAST_KNOWN_EVERY_S = 60.0
 ALARM_EVERY_S = 10.0
+END_EVERY_S = 10.0
+ENDS = 3
+"""So often an end is told: nobody repeats a lost datagram."""
 TICK_S = 0.2
 CONNECT_WITHIN_S = 10.0
 SEND_WITHIN_S = 5.0
@@ -72,16 +76,51 @@ def default_prefix() -> str:
     return f"relpos-{uuid.uuid5(uuid.NAMESPACE_OID, name).hex[:8]}"
 
 
+class _Lasting:
+    """What is told of members while it lasts, each ``every_s``, and its end a few times."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self._told: dict[int, tuple[float, int]] = {}
+        """When it was told last, and how often its end was."""
+
+    def lasts(self, node: int) -> bool:
+        """Return whether it was told, and its end was not."""
+        return node in self._told and not self._told[node][1]
+
+    def due(self, node: int, now_s: float, *, lasts: bool) -> bool | None:
+        """Return whether what is to be told now is its end; None where nothing is."""
+        told_s, ends = self._told.get(node, (-math.inf, 0))
+        if lasts and (ends or now_s - told_s >= self._every_s):
+            self._told[node] = now_s, 0
+            return False
+        if lasts or node not in self._told or ends >= ENDS:
+            return None
+        if ends and now_s - told_s < END_EVERY_S:
+            return None
+        self._told[node] = now_s, ends + 1
+        return True
+
+    def again(self) -> None:
+        """Tell everything once more."""
+        self._told = {node: (-math.inf, min(ends, 1)) for node, (_, ends) in self._told.items()}
+
+
 class Schedule:
     """Decides which events are due; its only state is what was sent before."""
 
     def __init__(self, events: Events) -> None:
         self._events = events
         self._sent_s: dict[int, float] = {}
-        self._alarm_sent_s: dict[int, float] = {}
-        self._marked_s: dict[int, float] = {}
+        self._alarms = _Lasting(ALARM_EVERY_S)
+        self._markers = _Lasting(LAST_KNOWN_EVERY_S)
         self._moved: dict[int, Moved] = {}
         self._seen_seq: dict[int, int] = {}
+
+    def again(self) -> None:
+        """Tell alarms, markers and their ends once more: a broken connection may have lost them."""
+        self._alarms.again()
+        self._markers.again()
 
     def due(
         self,
@@ -106,15 +145,10 @@ class Schedule:
         self, person: Person, view: TeamView, frame: MapFrame, now_s: float
     ) -> ET.Element | None:
         """Return the marker of a lost member's place where it is due, or its deletion."""
-        node, marked_s = person.node, self._marked_s.get(person.node)
-        lost = person.status == "lost"
-        if lost and (marked_s is None or now_s - marked_s >= LAST_KNOWN_EVERY_S):
-            self._marked_s[node] = now_s
-            return self._events.last_known(person, view, frame)
-        if not lost and marked_s is not None:
-            del self._marked_s[node]
-            return self._events.last_known(person, view, frame, over=True)
-        return None
+        if person.status == "lost" and (person.seen_s is None or not is_located(person)):
+            return None
+        over = self._markers.due(person.node, now_s, lasts=person.status == "lost")
+        return None if over is None else self._events.last_known(person, view, frame, over=over)
 
     def _event(
         self,
@@ -125,17 +159,13 @@ class Schedule:
         sigma_z_m: float | None,
     ) -> ET.Element | None:
         node = person.node
-        alarm_s = self._alarm_sent_s.get(node)
         # A member who lay still and then falls silent has not got up.
         lies = person.alert in (Alert.STILL_ALARM, Alert.FALL, Alert.MAYDAY) or (
-            alarm_s is not None and person.alert is Alert.LOST
+            self._alarms.lasts(node) and person.alert is Alert.LOST
         )
-        if lies and (alarm_s is None or now_s - alarm_s >= ALARM_EVERY_S):
-            self._alarm_sent_s[node] = now_s
-            return self._events.emergency(person, view, frame, sigma_z_m=sigma_z_m)
-        if not lies and alarm_s is not None:
-            del self._alarm_sent_s[node]
-            return self._events.emergency(person, view, frame, sigma_z_m=sigma_z_m, over=True)
+        over = self._alarms.due(node, now_s, lasts=lies)
+        if over is not None:
+            return self._events.emergency(person, view, frame, sigma_z_m=sigma_z_m, over=over)
         if self._seen_seq.get(node) == view.seq:
             return None
         if person.status == "lost" and now_s - self._sent_s.get(node, -1e9) < LOST_EVERY_S:
@@ -295,6 +325,7 @@ class CotSender(Sink):
         config: Any = {**tls, "COT_URL": self._url}
         reader, writer = await asyncio.wait_for(pytak.protocol_factory(config), CONNECT_WITHIN_S)
         worker = pytak.TXWorker(asyncio.Queue(), config, writer)
+        self._schedule.again()
         drained = asyncio.create_task(_drain(reader)) if reader is not None else None
         began_s = time.monotonic()
         settled_s = 0.0 if drained is not None else SETTLED_S

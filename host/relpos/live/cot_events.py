@@ -83,7 +83,7 @@ class Events:
         before: Moved | None = None,
     ) -> ET.Element | None:
         """Return the event of one member; None while its position is unknown or never received."""
-        if person.seen_s is None or not _located(person):
+        if person.seen_s is None or not is_located(person):
             return None
         fresh = person.status == "ok"
         seen_unix_s = view.unix_s - person.seen_s
@@ -138,16 +138,14 @@ class Events:
 
     def last_known(
         self, person: Person, view: TeamView, frame: MapFrame, *, over: bool = False
-    ) -> ET.Element | None:
+    ) -> ET.Element:
         """Return a marker at a lost member's last known place, or with ``over`` its deletion.
 
-        Clients delete a member some minutes after it is stale; the marker stays for a day. None
-        without a position.
+        Clients delete a member some minutes after it is stale; the marker stays for a day.
         """
-        if person.seen_s is None or not _located(person):
-            return None
         uid = f"{self.uid(person.node)}-last"
-        seen = datetime.fromtimestamp(view.unix_s - person.seen_s).astimezone().strftime("%H:%M:%S")
+        seen_unix_s = view.unix_s - (person.seen_s or 0.0)
+        seen = datetime.fromtimestamp(seen_unix_s).astimezone().strftime("%H:%M:%S")
         details = [
             ET.Element("contact", callsign=text(f"{person.name}, last known {seen}")),
             ET.Element("link", uid=uid if over else self.uid(person.node), type=MEMBER,
@@ -188,7 +186,7 @@ class Events:
             words.append("FELL")
         if person.floor is not None:
             words.append(f"floor {person.floor}")
-        if not _located(person):
+        if not is_located(person):
             words.append("position unknown")
         elif person.status == "ambiguous":
             words.append("position ambiguous")
@@ -239,14 +237,15 @@ def text(value: str) -> str:
     return _NOT_XML.sub("", value)
 
 
-def _located(person: Person) -> bool:
+def is_located(person: Person) -> bool:
+    """Return whether a member has a position, certain or not."""
     return person.x_m is not None and person.y_m is not None and person.status != "unlocated"
 
 
 def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Element:
     import pytak
 
-    if not _located(person):
+    if not is_located(person):
         point: ET.Element = pytak.cot_point(
             frame.latitude_deg, frame.longitude_deg, precision=DECIMALS
         )
