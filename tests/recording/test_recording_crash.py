@@ -12,11 +12,13 @@ import time
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from sessions import about, alike, play, session
 
 from relpos.recording import make_recorder, open_recording, save_recording
+from relpos.recording.container import Walk
 from relpos.recording.output import Disk
 from relpos.recording.recorder import Bounds, Recorder
 from relpos.recording.topics import Serial
@@ -165,6 +167,45 @@ def test_a_damaged_block_is_left_out_and_reported(tmp_path):
     assert recording.remarks == (f"{path}: 1 damaged blocks are left out",)
 
 
+def in_blocks(recorder, path, count):
+    """Record reads of the port, numbered from 0, ten to a block."""
+    for block in range(count):
+        size = path.stat().st_size
+        for number in range(10 * block, 10 * block + 10):
+            recorder.received(0.02 * number, b"%d" % number)
+        wait_for(lambda size=size: path.stat().st_size > size)
+
+
+def numbers(path):
+    return [int(serial.data) for serial in serials(path)]
+
+
+def offsets_of_chunks(path):
+    with path.open("rb") as file:
+        return [piece.offset for piece in Walk(file) if piece.opcode == Opcode.CHUNK]
+
+
+@pytest.mark.parametrize("at", [0, 3, 8], ids=["opcode", "length", "length's last byte"])
+def test_a_damaged_head_costs_its_block_and_nothing_behind_it(tmp_path, at):
+    path = tmp_path / "damaged.mcap"
+    recorder = make_recorder(path, about())
+    in_blocks(recorder, path, 4)
+    recorder.close()
+    data = bytearray(path.read_bytes())
+    data[offsets_of_chunks(path)[1] + at] ^= 0x40
+    path.write_bytes(data)
+    assert numbers(path) == [*range(10), *range(20, 40)]
+    recording = open_recording(path)
+    assert recording.remarks == (f"{path}: 1 damaged blocks are left out",)
+    whole = tmp_path / "whole.mcap"
+    (remark,) = save_recording(whole, recording.run, source=recording)
+    assert "could not be read" in remark
+    assert numbers(whole) == numbers(path)
+    with whole.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert sum(1 for _ in reader.iter_messages("/serial")) == 30
+
+
 # --- the disk ------------------------------------------------------------------------------------
 
 
@@ -275,6 +316,48 @@ def test_a_file_that_may_not_grow_is_followed_by_another_part(tmp_path):
     assert recording.remarks == ()
     save_recording(tmp_path / "one.mcap", recording.run, source=recording)
     assert len(serials(tmp_path / "one.mcap")) == len(steps)
+
+
+def test_what_a_part_repeats_of_the_one_before_is_once_in_the_joined_recording(
+    tmp_path, monkeypatch
+):
+    class PulledOut(Disk):
+        calls = 0
+
+        def sync(self, file):
+            self.calls += 1
+            if self.calls == 3:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    path, disk, cut = tmp_path / "pulled.mcap", PulledOut(), os.ftruncate
+
+    def ftruncate(file, size):
+        if not (tmp_path / "pulled.part2.mcap").exists():
+            cut(file, size)
+
+    monkeypatch.setattr(os, "ftruncate", ftruncate)
+    recorder = Recorder(path, about(), disk=disk)
+    in_blocks(recorder, path, 2)
+    recorder.received(1.0, b"20")
+    wait_for(lambda: disk.calls > 3)
+    recorder.close()
+    recording = open_recording(path)
+    assert len(recording.files) == 2
+    assert numbers(path) == list(range(21))
+    save_recording(tmp_path / "one.mcap", recording.run, source=recording)
+    assert numbers(tmp_path / "one.mcap") == list(range(21))
+
+
+def test_a_notice_that_is_no_text_does_not_end_the_recording(tmp_path):
+    path = tmp_path / "name.mcap"
+    recorder = make_recorder(path, about())
+    recorder.received(0.0, b"0")
+    recorder.log("warning", "ca\udce9.csv: disk full")  # A file's name that is not UTF-8.
+    recorder.received(0.1, b"1")
+    recorder.close()
+    assert recorder.trouble() is None
+    assert numbers(path) == [0, 1]
+    assert any(b"disk full" in entry.data for entry in open_recording(path).entries({"/log"}))
 
 
 def test_a_disk_that_confirms_nothing_blocks_no_writer_and_is_reported(tmp_path, monkeypatch):

@@ -47,6 +47,9 @@ MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
 """Head of a record: one byte for the opcode, eight for the length."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
+_PACKED = struct.pack("<I", 4) + b"zstd"
+"""Stands behind the head of each of our chunks, and hardly anywhere else."""
+_SEARCH_BYTES = 1 << 20
 MOST_UNPACKED_BYTES = 64 << 20
 MOST_RATIO = 200
 MOST_RATIO_FROM_BYTES = 1 << 16
@@ -171,8 +174,10 @@ class Piece:
 class Walk:
     """The records of a file one after the other, as far as they are whole.
 
-    Afterwards ``end`` is where the last whole record before the end of the data ends, and
-    ``complete`` whether the file was closed: it has its summary and its closing magic.
+    Where the head of a record is damaged, it goes on with the next of our chunks. Afterwards
+    ``end`` is where the last whole record before the end of the data ends, ``complete`` whether the
+    file was closed (it has its summary and its closing magic), and ``gaps`` how many bytes were
+    passed over at each damaged place.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -180,6 +185,7 @@ class Walk:
         self.size = file.seek(0, os.SEEK_END)
         self.end = 0
         self.complete = False
+        self.gaps: list[int] = []
 
     def __iter__(self) -> Iterator[Piece]:
         """Yield what stands before the end of the data; nothing where it is no MCAP at all."""
@@ -195,12 +201,36 @@ class Walk:
                 self.complete = self.file.read() == MAGIC
                 return
             after = self.end + HEAD_BYTES + length
-            # A block that a crash left full of zeros, or half written.
             if opcode not in CONTENT or after > self.size:
-                return
+                found = self._next_chunk()
+                if found is None:  # A block that a crash left full of zeros, or half written.
+                    return
+                self.gaps.append(found - self.end)
+                self.end = found
+                continue
             piece = Piece(self.end, opcode, HEAD_BYTES + length)
             self.end = after
             yield piece
+
+    def _next_chunk(self) -> int | None:
+        """Return where the next whole chunk of ours begins; None where there is none."""
+        before = HEAD_BYTES + _CHUNK_HEAD.size
+        at = self.end + 1 + before
+        while True:
+            self.file.seek(at)
+            part = self.file.read(_SEARCH_BYTES)
+            found = part.find(_PACKED)
+            if found < 0:
+                if len(part) < _SEARCH_BYTES:
+                    return None
+                at += len(part) - len(_PACKED) + 1
+                continue
+            start = at + found - before
+            self.file.seek(start)
+            opcode, length = struct.unpack("<BQ", self.file.read(HEAD_BYTES))
+            if opcode == Opcode.CHUNK and start + HEAD_BYTES + length <= self.size:
+                return start
+            at += found + 1
 
     def payload(self, piece: Piece, most: int | None = None) -> bytes:
         """Content of a record, or its first ``most`` bytes."""
@@ -385,11 +415,14 @@ def finish(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def copy_blocks(source: IO[bytes], out: IO[bytes], *, beginning: bool) -> int:
-    """Copy every record that can be read; returns how many bytes cannot.
+def copy_blocks(
+    source: IO[bytes], out: IO[bytes], newest: int, *, beginning: bool
+) -> tuple[int, int]:
+    """Copy every record that can be read; how many bytes cannot, and the newest sequence number.
 
     A block whose checksum does not fit is left out; the index of a block's messages is made anew,
-    for it may be what was cut off. Without ``beginning`` the blocks alone are copied.
+    for it may be what was cut off. Without ``beginning`` the blocks alone are copied, without those
+    up to ``newest``: a part begins with what the one before may hold as well.
     """
     lost = 0
     walk = Walk(source)
@@ -402,23 +435,29 @@ def copy_blocks(source: IO[bytes], out: IO[bytes], *, beginning: bool) -> int:
         indexes = b""
         if piece.opcode == Opcode.CHUNK:
             try:
-                indexes = _message_indexes(unpack(parse(Chunk, payload)))
+                indexes, last = _message_indexes(unpack(parse(Chunk, payload)))
             except ValueError:
                 lost += piece.length
                 continue
+            if not beginning and last <= newest:
+                continue
+            newest = max(newest, last)
         out.write(struct.pack("<BQ", piece.opcode, piece.length - HEAD_BYTES) + payload + indexes)
-    return lost + (0 if walk.complete else walk.size - walk.end)
+    return lost + sum(walk.gaps) + (0 if walk.complete else walk.size - walk.end), newest
 
 
-def _message_indexes(raw: bytes) -> bytes:
+def _message_indexes(raw: bytes) -> tuple[bytes, int]:
+    """Return the index of a chunk's messages, and the greatest of their sequence numbers."""
+    last = -1
     entries: dict[int, list[tuple[int, int]]] = {}
     at = 0
     for opcode, content in records_in(raw):
         if opcode == Opcode.MESSAGE:
-            number, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
+            number, sequence, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
+            last = max(last, sequence)
             entries.setdefault(number, []).append((log_ns, at))
         at += HEAD_BYTES + len(content)
     builder = RecordBuilder()
     for number, places in sorted(entries.items()):
         MessageIndex(number, places).write(builder)
-    return _bytes_of(builder)
+    return _bytes_of(builder), last

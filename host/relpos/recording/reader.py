@@ -289,6 +289,7 @@ def _look_through(path: Path) -> _File:
                 _look_into(found, walk.payload(piece))
             elif piece.opcode == Opcode.MESSAGE:
                 found.damaged += piece.length < HEAD_BYTES + MESSAGE_HEAD.size
+        found.damaged += len(walk.gaps)
         found.unread = 0 if walk.complete else walk.size - walk.end
         found.closed = walk.complete
     return found

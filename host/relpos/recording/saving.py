@@ -65,12 +65,13 @@ def _write_run(
 
 
 def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
-    lost = 0
+    lost, newest = 0, -1
+    out.write(container.MAGIC)
     for file in source.files:
         with file.path.open("rb") as stream:
-            if file is source.files[0]:
-                out.write(container.MAGIC)
-            lost += container.copy_blocks(stream, out, beginning=file is source.files[0])
+            is_first = file is source.files[0]
+            unread, newest = container.copy_blocks(stream, out, newest, beginning=is_first)
+            lost += unread
     there = {channel.topic: number for number, channel in source.files[0].channels.items()}
     further = [topic for topic in all_topics() if topic.name not in there]
     free = max(there.values(), default=0) + 1

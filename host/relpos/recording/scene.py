@@ -14,6 +14,7 @@ from typing import Any
 from foxglove import Schema
 from foxglove import messages as m
 
+from relpos.files import displayable
 from relpos.fusion.estimator import Alternative, Estimate, NodeEstimate, NodeStatus, Shape
 from relpos.measurements import Range
 from relpos.recording.topics import LOG, TEAM, TRANSFORMS
@@ -55,7 +56,7 @@ def log_message(unix_ns: int, level: str, text: str) -> bytes:
     message = m.Log(
         timestamp=_stamp(unix_ns),
         level=levels.get(level, m.LogLevel.Info),
-        message=text,
+        message=displayable(text),
         name="relpos",
     )
     return bytes(message.encode())
