@@ -20,7 +20,7 @@ from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.link import xbee
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Received
-from relpos.live.mission import JOURNAL, Journal, Mission, MissionFiles, read_again
+from relpos.live.mission import JOURNAL, TRACKS, Journal, Mission, MissionFiles, read_again
 from relpos.live.requests import Request
 from relpos.live.session import Outcome
 from relpos.live.sinks import Sink
@@ -199,6 +199,23 @@ def test_a_line_that_a_power_cut_left_half_costs_no_other_line(tmp_path):
     journal.add({"kind": "name", "node": 2, "name": "Ben"})
     journal.close()
     assert [event["name"] for event in mission.events()] == ["Anna", "Ben"]
+
+
+@pytest.mark.parametrize("half", ["1", "1,12.5", "1,12.50,3", "1,12.50,3.10,13"])
+def test_a_point_of_a_track_that_a_power_cut_left_half_is_none(tmp_path, half):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    (mission.path / TRACKS).write_text("1,10.00,1.00,1.00\n" + half)
+    whole = [(10.0, 1.0, 1.0)]
+    assert mission.resume().tracks.of(1) == whole
+    journal = Journal(mission.path / JOURNAL)
+    files = MissionFiles(mission, journal)
+    at = NodeEstimate(1, 4.0, 5.0, 0.1, 0.5, 0.4, 0.0, 0.2, NodeStatus.OK)
+    files.estimated(Estimate(13.0, (at,), ()))
+    journal.close()
+    assert files.trouble() is None
+    tracks = mission.resume().tracks
+    assert tracks.of(1) == [*whole, (13.0, 4.0, 5.0)]
+    assert tracks.of(11) == []
 
 
 def test_one_session_at_a_time_has_a_mission(tmp_path):
@@ -455,6 +472,32 @@ def test_a_start_at_one_pose_outlives_a_kill_before_the_first_checkpoint(tmp_pat
     for asked in ((*again, "loop://", "--initial", "common"), again, again):
         relpos(*asked)
     assert sessions == [(True, 0), (True, 1), (False, 0)]
+
+
+def test_what_was_received_before_a_session_that_heard_nobody_is_read_again(tmp_path, monkeypatch):
+    values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 1.0}
+    sent = xbee.encode(xbee.Receive16(1, -40, framing.encode(wire.MOTION, 1, 0, 1, values)))
+    heard = []
+
+    def session(job, source, options, **_):
+        heard.append([] if source._earlier is None else [r.arrival_s for r in source._earlier])
+        mission = options.mission.folder
+        recorder = make_recorder(options.record, About(round(mission.about.started_unix_s * 1e9)))
+        recorder.log("info", "no node is heard yet")
+        if len(heard) == 1:
+            recorder.received(95.0, sent)
+            checkpoint = {"time_s": 99.0, "arrived_s": 100.0, "heard_s": {}, "priors": []}
+            (mission.path / "checkpoint.json").write_text(json.dumps(checkpoint))
+            mission.about.started_unix_s -= 200.0
+        recorder.close()
+        source.close()
+        return Outcome()
+
+    monkeypatch.setattr(command, "fuse_live", session)
+    again = ("mission", tmp_path / "mill", "--estimator", "deadreckoning", "--no-open")
+    for asked in ((*again, "loop://"), again, again):
+        assert relpos(*asked).exit_code == 0
+    assert heard == [[], [95.0], [95.0]]
 
 
 def test_a_file_that_a_running_session_replaces_meanwhile_is_no_foreign_one(

@@ -250,12 +250,12 @@ def _earlier(
         for path in reversed(found.recordings()):
             try:
                 recording = open_recording(path)
+                first = next(recording.inputs(), None)
             except DataError:
                 continue
             chosen.insert(0, recording)
-            first_ns = recording.files[0].first_ns
-            began_s = 0.0 if first_ns is None else first_ns * 1e-9 - found.about.started_unix_s
-            if began_s <= resumed.arrived_s - WARM_UP_S:
+            # A session that received nothing has nothing of the seconds before the checkpoint.
+            if first is not None and first[0] <= resumed.arrived_s - WARM_UP_S:
                 break
         for recording in chosen:
             yield from read_again(recording.inputs(), link.feed, resumed)

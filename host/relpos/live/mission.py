@@ -209,9 +209,12 @@ class Mission:
             resumed.since_s, resumed.priors = since_s, rows
         for line in _lines(self.path / TRACKS):
             with contextlib.suppress(ValueError):
+                if not line.endswith(b"\n"):
+                    raise ValueError("cut off")
                 node, *point = line.decode().split(",")
-                time_s, x_m, y_m = map(_bounded, ("time_s", "x_m", "y_m"), map(float, point))
-                resumed.tracks.add(int(node), time_s, x_m, y_m)
+                names = ("time_s", "x_m", "y_m")
+                where = [_bounded(*row) for row in zip(names, map(float, point), strict=True)]
+                resumed.tracks.add(int(node), *where)
         return resumed
 
     def is_running(self) -> bool:
@@ -311,7 +314,7 @@ class Journal:
             size = file.tell()
             # A line that a power cut left half must not swallow the next one.
             data = text.encode()
-            if size and not _ends_line(self._path):
+            if not _ends_line(self._path):
                 data = b"\n" + data
             try:
                 file.write(data)
@@ -360,6 +363,8 @@ class MissionFiles(Sink):
         try:
             if self._lines:
                 with (self._path / TRACKS).open("a", encoding="utf-8") as file:
+                    if not _ends_line(self._path / TRACKS):
+                        file.write("?\n")  # No half line becomes a whole one.
                     file.writelines(self._lines)
                 self._lines.clear()
             heard_s = {str(node): at_s for node, at_s in self._heard_s.items()}
@@ -496,6 +501,9 @@ def _check_own_files(folder: Path) -> None:
 
 
 def _ends_line(path: Path) -> bool:
+    """Return whether the next line would begin one: nothing, or no half line, is there."""
     with path.open("rb") as file:
+        if not file.seek(0, os.SEEK_END):
+            return True
         file.seek(-1, os.SEEK_END)
         return file.read(1) == b"\n"
