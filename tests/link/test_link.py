@@ -296,6 +296,18 @@ def test_a_restart_after_days_widens_within_the_bounds_of_a_motion():
     assert motion.sigma_x_m == pytest.approx(900.0)
 
 
+def test_what_no_file_can_hold_is_no_observation_and_is_counted():
+    decoder = Decoder()
+    decoder.feed(motion_frame(1, time_s=1.0), 1.0)
+    leap = motion_frame(2, time_s=2.0, x_m=2000.0, quality=wire.Quality.HEIGHT_VALID)
+    assert decoder.feed(leap, 2.0) == [Height(2.0, 1, 0.0)]
+    assert decoder.feed(ranges_frame(3, 2.5, peer=1, range_m=3.0, age_s=0.0), 2.5) == []
+    (motion,) = decoder.feed(motion_frame(4, time_s=3.0, x_m=2001.0), 3.0)
+    assert motion.dx_m == pytest.approx(1.0)
+    counts = decoder.nodes[1].counts
+    assert (counts["beyond_bounds"], counts["ranges_to_itself"]) == (1, 1)
+
+
 def test_a_restart_before_the_first_motion_widens_nothing():
     decoder = Decoder()
     status = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": 1.0}

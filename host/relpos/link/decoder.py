@@ -16,7 +16,17 @@ from typing import Any
 
 from relpos.link.authentication import CounterWindow, Verdict
 from relpos.link.clock import NodeClock
-from relpos.measurements import Heading, Height, Motion, Observation, Range, RawSample, Status, Step
+from relpos.measurements import (
+    Heading,
+    Height,
+    Motion,
+    Observation,
+    Range,
+    RawSample,
+    Status,
+    Step,
+    out_of_bounds,
+)
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.said import Said
@@ -201,7 +211,11 @@ class Decoder:
                 )
                 for entry in values["steps"]
             ]
-        return observations
+        # What no reader of files takes would make the whole recording unreadable.
+        good = [o for o in observations if out_of_bounds(o) is None]
+        if len(good) < len(observations):
+            track.counts["beyond_bounds"] += len(observations) - len(good)
+        return good
 
     def _raw(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> RawSample:
         count = values["samples"]
@@ -255,6 +269,9 @@ class Decoder:
         """Return ranges with both ends' offsets, from their antenna delays, subtracted."""
         ranges: list[Observation] = []
         for entry in values["ranges"]:
+            if entry["peer"] == node:
+                track.counts["ranges_to_itself"] += 1
+                continue
             offset_m = sum(self.range_offsets_m.get(end, 0.0) for end in (node, entry["peer"]))
             range_m = entry["range_m"] - offset_m
             if range_m <= 0.0:
