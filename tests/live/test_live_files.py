@@ -93,6 +93,13 @@ def table(tmp_path, monkeypatch):
     return AppendedTable(tmp_path / "table.csv", ["time_s", "node"], wanted=False)
 
 
+def test_a_cell_that_is_no_text_ends_no_table(tmp_path):
+    made = AppendedTable(tmp_path / "log.csv", ["text"])
+    made.add([["ca\udce9.csv: disk full"], ["more"]])
+    made.close()
+    assert made.path.read_text() == "text\nca?.csv: disk full\nmore\n"
+
+
 def test_a_table_that_a_full_disk_does_not_take_is_named():
     with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
         write_rows(Path("/dev/full"), ["time_s"], [[1.0]])

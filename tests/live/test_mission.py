@@ -14,23 +14,26 @@ from team_input import TeamInput, make_session
 
 from relpos import fusion
 from relpos.cli import mission as command
+from relpos.cli.live import _about
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.link import xbee
+from relpos.live.assembly import MissionPlan, SessionPlan
 from relpos.live.fusion_thread import FusionThread
-from relpos.live.inputs import Received
+from relpos.live.inputs import PacedInput, Received
 from relpos.live.mission import JOURNAL, TRACKS, Journal, Mission, MissionFiles, read_again
 from relpos.live.requests import Request
 from relpos.live.session import Outcome
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Alert
+from relpos.live.team_view import Alert, Hello
 from relpos.live.tracks import Tracks
 from relpos.measurements import Motion
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.recording import make_recorder
 from relpos.recording.about import About
+from relpos.runs import Description
 from support.command import relpos
 
 
@@ -498,6 +501,17 @@ def test_what_was_received_before_a_session_that_heard_nobody_is_read_again(tmp_
     for asked in ((*again, "loop://"), again, again):
         assert relpos(*asked).exit_code == 0
     assert heard == [[], [95.0], [95.0]]
+
+
+@pytest.mark.parametrize("sessions", [1, 2])
+def test_a_recording_tells_whether_its_session_went_on_from_another(tmp_path, sessions):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    mission.about.sessions = sessions
+    kept = MissionPlan(mission, mission.resume())
+    plan = SessionPlan("m", tmp_path, Description(), lambda _: Failing(()), "bank", mission=kept)
+    about = _about(PacedInput("port", []), plan, Hello("m", "port", "bank", 1.0))
+    assert about.resumed is (sessions > 1)
+    assert About.read("m", about.metadata()).resumed is about.resumed
 
 
 def test_a_file_that_a_running_session_replaces_meanwhile_is_no_foreign_one(

@@ -12,9 +12,12 @@ from mcap_protobuf.decoder import DecoderFactory
 from sessions import START_NS, about, alike, play, serial_bytes, session
 
 from relpos.errors import DataError
+from relpos.link import xbee
 from relpos.link.port import Link
 from relpos.live.team_view import Level, Notice, TeamView
 from relpos.measurements import Event, Heading, Motion, Range, Truth
+from relpos.protocol import framing
+from relpos.protocol import messages as wire
 from relpos.protocol.messages import DEFAULT_KEY, PROTOCOL_VERSION
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
 from relpos.recording.replay import Replay
@@ -243,3 +246,17 @@ def test_the_lines_of_python_in_the_page_read_it(recorded, tmp_path, monkeypatch
     ranges = [o for *_, found, _ in session() for o in found if isinstance(o, Range)]
     assert "mean" in output
     assert str(min((o.node, o.peer) for o in ranges)[0]) in output
+
+
+def test_of_a_session_that_went_on_what_was_decoded_counts_and_no_way_before_it(tmp_path):
+    """Its bytes have totals since the nodes' start, of which the session before knew most."""
+    values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 300.0, "x_m": 50.25}
+    frame = framing.encode(wire.MOTION, 1, 0, 9, values)
+    recorder = make_recorder(tmp_path / "later.mcap", about(resumed=True))
+    recorder.received(300.0, xbee.encode(xbee.Receive16(1, -40, frame)))
+    motion = Motion(300.0, 1, 0.25, 0.0, 0.0)
+    recorder.observed(300.0, [motion])
+    recorder.close()
+    replay = Replay(open_recording(tmp_path / "later.mcap"), DEFAULT_KEY)
+    assert replay.observations() == (motion,)
+    assert "went on from one before" in replay.remarks[0]

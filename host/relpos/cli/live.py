@@ -229,6 +229,7 @@ def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
         initial="common" if plan.common else None,
         own_key=link is not None and not link.keyless,
         newest_counters={} if link is None else link.counters_before,
+        resumed=plan.mission is not None and plan.mission.folder.about.sessions > 1,
         # The name of a port is not that of the recording.
         description=replace(
             plan.description,

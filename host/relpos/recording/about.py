@@ -22,7 +22,8 @@ class About:
 
     ``started_unix_ns`` is Unix time at the session's second 0. ``own_key``: the team has another
     key than the one that every new node has; the key itself is not recorded.
-    ``newest_counters``: of each node before the session, nothing up to it was taken.
+    ``newest_counters``: of each node before the session, nothing up to it was taken. ``resumed``:
+    it went on from a session before, whose totals of the nodes are not in this recording.
     """
 
     started_unix_ns: int
@@ -33,6 +34,7 @@ class About:
     initial: str | None = None
     own_key: bool = False
     newest_counters: Mapping[int, int] = field(default_factory=dict)
+    resumed: bool = False
     description: Description = field(default_factory=Description)
     """Names, mounting and known starts of the nodes, as in ``run.toml``."""
     version: str = ""
@@ -54,6 +56,7 @@ class About:
                 "initial": self.initial or "",
                 "own_key": "true" if self.own_key else "false",
                 "newest_counters": json.dumps(dict(self.newest_counters)),
+                "resumed": "true" if self.resumed else "false",
             },
             DESCRIPTION: {"text": description_text(self.description)},
         }
@@ -79,6 +82,7 @@ class About:
                 initial=values.get("initial") or None,
                 own_key=values.get("own_key") == "true",
                 newest_counters={int(node): int(n) for node, n in counters.items()},
+                resumed=values.get("resumed") == "true",
                 description=parse_description(
                     f"{where}: {DESCRIPTION}", records.get(DESCRIPTION, {}).get("text", "")
                 ),

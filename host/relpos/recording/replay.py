@@ -18,8 +18,9 @@ from relpos.recording.reader import Recording
 class Replay:
     """The inputs of a session in its order, through the link again.
 
-    Without the team's ``key`` (None), where no bytes were recorded, or other than this version's,
-    they are what was decoded when it was recorded. ``link`` is None then, and ``remarks`` says why.
+    Without the team's ``key`` (None), where no bytes were recorded, other than this version's, or
+    in the middle of a mission, they are what was decoded when it was recorded. ``link`` is None
+    then, and ``remarks`` says why.
     """
 
     recording: Recording
@@ -42,6 +43,13 @@ class Replay:
                 f"{self.recording.path}: recorded by relpos {about.version} under protocol version "
                 f"{about.protocol}, this is {PROTOCOL_VERSION}: the measurements are those that "
                 "were decoded when it was recorded",
+            )
+            return
+        if about is not None and about.resumed:
+            # Its bytes alone make the first motion of each node all of it since the node's start.
+            self.remarks = (
+                f"{self.recording.path}: the session went on from one before: the measurements are "
+                "those that were decoded when it was recorded",
             )
             return
         self.link = Link(key=self.key, newest_counters=about.newest_counters if about else None)

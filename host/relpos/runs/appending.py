@@ -82,7 +82,8 @@ class AppendedTable:
         if not self._wanted:
             return
         self._tried_s = time.monotonic()
-        self._waiting += self._text.getvalue().encode()
+        # A file's name that a notice tells need not be text.
+        self._waiting += self._text.getvalue().encode(errors="replace")
         self._text.seek(0)
         self._text.truncate()
         try:
