@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
 from sessions import about, play, session
 
 from relpos.cli.smoothing import Smoothing
 from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
@@ -53,6 +55,26 @@ def test_a_recording_whose_head_is_damaged_is_refused_in_one_line(recorded, tmp_
     path.write_bytes(data.replace(name, b"\xff" * len(name), 1))
     with pytest.raises(DataError, match="damaged"):
         Moments([path])
+
+
+def test_sessions_of_a_mission_between_which_the_clock_was_set_follow_each_other(tmp_path):
+    began_ns = about().started_unix_ns
+    paths = [tmp_path / "1.mcap", tmp_path / "2.mcap"]
+    for path, start_ns, first_s in zip(paths, (began_ns - 10**17, began_ns), (0, 100), strict=True):
+        recorder = Recorder(path, replace(about(), started_unix_ns=start_ns))
+        for second in range(first_s, first_s + 10):
+            recorder.observed(second, [Motion(float(second), 1, 0.1, 0.0, 0.0)])
+            node = NodeEstimate(1, second, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, NodeStatus.OK)
+            recorder.estimated(Estimate(float(second), (node,), ()))
+        recorder.close()
+    moments = Moments(paths)
+    assert (moments.from_s, moments.to_s) == (0.0, 109.0)
+    for at_s in (4.0, 104.0):
+        estimate = moments.estimate_at(at_s)
+        assert estimate is not None
+        assert estimate.time_s == at_s
+    seconds = [row.time_s for _, row in moments.rows(0.0, 109.0, Motion)]
+    assert seconds == [*range(10), *range(100, 110)]
 
 
 def test_a_recording_that_is_a_device_is_refused(tmp_path):

@@ -45,6 +45,8 @@ _READ = _LISTS | {topics.ROWS[kind] for kind in (Motion, Event, Status, Range)}
 
 @dataclass(frozen=True)
 class _Block:
+    """One chunk, between two times of the session."""
+
     start_ns: int
     end_ns: int
     file: int
@@ -73,10 +75,13 @@ class Moments:
         self._kept_bytes = 0
         self._without: set[int] = set()
         """Blocks that were seen to hold no estimate."""
+        self._starts_ns: list[int] = []
+        """Unix time of second 0 in each file: where a computer's clock was set, it differs."""
         about: About | None = None
         for number, walk in enumerate(self._walks):
             metadata: dict[str, dict[str, str]] = {}
             names: dict[int, str] = {}
+            blocks: list[_Block] = []
             for piece in walk:
                 if piece.opcode == Opcode.METADATA:
                     record = parsed(paths[number], Metadata, walk.payload(piece))
@@ -86,18 +91,23 @@ class Moments:
                     names[channel.id] = channel.topic
                 elif piece.opcode == Opcode.CHUNK and piece.length >= HEAD_BYTES + 16:
                     start_ns, end_ns = struct.unpack("<QQ", walk.payload(piece, 16))
-                    self._blocks.append(_Block(start_ns, end_ns, number, piece))
+                    blocks.append(_Block(start_ns, end_ns, number, piece))
             self._topics.append(names)
             found = About.read(str(paths[number]), metadata)
             about = found if found is not None else about
+            zero_ns = about.started_unix_ns if about is not None else 0
+            self._starts_ns.append(zero_ns)
+            self._blocks += [
+                replace(b, start_ns=b.start_ns - zero_ns, end_ns=b.end_ns - zero_ns) for b in blocks
+            ]
         if about is None or not self._blocks:
             raise DataError(f"{paths[0]}: no recording of relpos, or nothing in it")
         self.started_unix_s = about.started_unix_ns * 1e-9
         self.description: Description = about.description
         self._blocks.sort(key=lambda block: block.end_ns)
         self._ends = [block.end_ns for block in self._blocks]
-        self.from_s = self._session_s(min(block.start_ns for block in self._blocks))
-        self.to_s = self._session_s(self._ends[-1])
+        self.from_s = min(block.start_ns for block in self._blocks) * 1e-9
+        self.to_s = self._ends[-1] * 1e-9
 
     def again(self) -> Moments:
         """Return the same with files of their own, for another thread."""
@@ -108,13 +118,10 @@ class Moments:
         for file in self._files:
             file.close()
 
-    def _session_s(self, log_ns: int) -> float:
-        return log_ns * 1e-9 - self.started_unix_s
-
     def between(self, from_s: float, to_s: float, wanted: Collection[str]) -> Iterator[Message]:
         """Yield the messages of that time and of those topics, in order."""
-        first = bisect_right(self._ends, int((from_s + self.started_unix_s) * 1e9) - 1)
-        until_ns = int((to_s + self.started_unix_s) * 1e9)
+        first = bisect_right(self._ends, round(from_s * 1e9) - 1)
+        until_ns = round(to_s * 1e9)
         for index in range(first, len(self._blocks)):
             if self._blocks[index].start_ns > until_ns:
                 break
@@ -128,6 +135,7 @@ class Moments:
             return self._kept[index]
         block = self._blocks[index]
         names, walk = self._topics[block.file], self._walks[block.file]
+        zero_ns = self._starts_ns[block.file]
         messages = []
         try:
             raw = unpack(parse(Chunk, walk.payload(block.piece)))
@@ -137,7 +145,7 @@ class Moments:
                     topic = names.get(channel, "")
                     if topic in _READ:
                         data = bytes(content[MESSAGE_HEAD.size :])
-                        messages.append(Message(self._session_s(log_ns), topic, data))
+                        messages.append(Message((log_ns - zero_ns) * 1e-9, topic, data))
         except ValueError:
             messages = []  # A damaged block: what it held is missing, nothing else.
         self._kept[index] = messages
@@ -152,7 +160,7 @@ class Moments:
 
         From that moment backwards: of a recording's lists those of one estimate alone are decoded.
         """
-        until_ns = int((time_s + self.started_unix_s) * 1e9)
+        until_ns = round(time_s * 1e9)
         last = min(bisect_right(self._ends, until_ns), len(self._blocks) - 1)
         later: list[Any] = []
         for index in range(last, -1, -1):
