@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from dataclasses import replace
 
@@ -17,6 +19,7 @@ from relpos.live.team_view import Alert
 from relpos.measurements import Motion
 from relpos.recording import open_recording, topics
 from relpos.recording.moments import Moments
+from relpos.recording.output import Disk
 from relpos.recording.player import History, Player
 from relpos.recording.recorder import Recorder
 
@@ -75,6 +78,40 @@ def test_sessions_of_a_mission_between_which_the_clock_was_set_follow_each_other
         assert estimate.time_s == at_s
     seconds = [row.time_s for _, row in moments.rows(0.0, 109.0, Motion)]
     assert seconds == [*range(10), *range(100, 110)]
+
+
+def test_a_recording_is_played_with_its_further_parts_and_nothing_in_them_twice(
+    tmp_path, monkeypatch
+):
+    class PulledOut(Disk):
+        calls = 0
+
+        def sync(self, file):
+            self.calls += 1
+            if self.calls == 2:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    path, part = tmp_path / "walk.mcap", tmp_path / "walk.part2.mcap"
+    cut = os.ftruncate
+    monkeypatch.setattr(os, "ftruncate", lambda *to: part.exists() or cut(*to))
+    recorder = Recorder(path, about(), disk=PulledOut())
+    second = 0
+    while not part.exists():
+        second += 1
+        assert second < 600
+        recorder.observed(second, [Motion(float(second), 1, 0.1, 0.0, 0.0)])
+        time.sleep(0.1)
+    recorder.close()
+
+    def seconds():
+        return [row.time_s for _, row in Moments([path]).rows(0.0, 1e6, Motion)]
+
+    assert seconds() == [*range(1, second + 1)]
+    part.rename(tmp_path / "other.mcap")
+    alone = seconds()
+    assert alone
+    Recorder(part, replace(about(), started_unix_ns=1)).close()
+    assert seconds() == alone, "another recording's file is no part"
 
 
 def test_a_recording_that_is_a_device_is_refused(tmp_path):

@@ -31,6 +31,7 @@ from relpos.recording.container import (
     records_in,
     unpack,
 )
+from relpos.recording.output import part_path
 from relpos.recording.reader import UNREADABLE, opened, parsed
 from relpos.runs.description import Description
 
@@ -63,10 +64,14 @@ class Message:
 
 
 class Moments:
-    """The moments of recordings that belong together. DataError where one is none of ours."""
+    """The moments of recordings that belong together, and of their further parts.
+
+    DataError where one is none of ours.
+    """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = list(paths)
+        paths = [part for path in paths for part in _parts_of(path)]
         self._files = [opened(path) for path in paths]
         self._walks = [Walk(file) for file in self._files]
         self._topics: list[dict[int, str]] = []
@@ -77,6 +82,7 @@ class Moments:
         """Blocks that were seen to hold no estimate."""
         self._starts_ns: list[int] = []
         """Unix time of second 0 in each file: where a computer's clock was set, it differs."""
+        seen: set[tuple[int, int, int]] = set()
         about: About | None = None
         for number, walk in enumerate(self._walks):
             metadata: dict[str, dict[str, str]] = {}
@@ -94,12 +100,18 @@ class Moments:
                     blocks.append(_Block(start_ns, end_ns, number, piece))
             self._topics.append(names)
             found = About.read(str(paths[number]), metadata)
-            about = found if found is not None else about
-            zero_ns = about.started_unix_ns if about is not None else 0
+            before_ns = about.started_unix_ns if about is not None else 0
+            zero_ns = before_ns if found is None else found.started_unix_ns
             self._starts_ns.append(zero_ns)
-            self._blocks += [
-                replace(b, start_ns=b.start_ns - zero_ns, end_ns=b.end_ns - zero_ns) for b in blocks
-            ]
+            if paths[number] not in self._paths and (found is None or zero_ns != before_ns):
+                continue  # Another recording's, by its name alone a part of this.
+            about = found if found is not None else about
+            for b in blocks:
+                # A part begins with what the one before may hold as well.
+                if (b.start_ns, b.end_ns, b.piece.length) not in seen:
+                    start_ns, end_ns = b.start_ns - zero_ns, b.end_ns - zero_ns
+                    self._blocks.append(replace(b, start_ns=start_ns, end_ns=end_ns))
+            seen |= {(b.start_ns, b.end_ns, b.piece.length) for b in blocks}
         if about is None or not self._blocks:
             raise DataError(f"{paths[0]}: no recording of relpos, or nothing in it")
         self.started_unix_s = about.started_unix_ns * 1e-9
@@ -186,6 +198,15 @@ class Moments:
             row = _decoded(topics.decode_row, message)
             if row is not None:
                 yield message.time_s, row
+
+
+def _parts_of(path: Path) -> Iterator[Path]:
+    """Yield a recording's file, and those that may be its further parts."""
+    number, part = 1, path
+    while number == 1 or part.exists():
+        yield part
+        number += 1
+        part = part_path(path, number)
 
 
 def _decoded(decode: Any, message: Message) -> Any:
