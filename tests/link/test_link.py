@@ -308,6 +308,11 @@ def test_what_no_file_can_hold_is_no_observation_and_is_counted():
     assert (counts["beyond_bounds"], counts["ranges_to_itself"]) == (1, 1)
 
 
+def test_alarms_have_motions_to_go_by_also_after_a_week():
+    decoder = Decoder()
+    assert motions(decoder.feed(motion_frame(1, time_s=1.0), 8 * 86_400.0))
+
+
 def test_a_restart_before_the_first_motion_widens_nothing():
     decoder = Decoder()
     status = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": 1.0}
