@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,7 +40,10 @@ def row_of(name: str, shown: list[str]) -> str:
 
 
 @pytest.mark.parametrize("utf8", [True, False])
-@pytest.mark.parametrize(("columns", "rows"), [(80, 24), (60, 15), (132, 43), (200, 12), (40, 10)])
+@pytest.mark.parametrize(
+    ("columns", "rows"),
+    [(80, 24), (60, 15), (132, 43), (200, 12), (40, 10), (132, 4), (132, 1), (1, 9)],
+)
 @pytest.mark.parametrize("people", ["well", "in need", "empty"])
 def test_the_page_is_as_large_as_the_terminal(
     columns: int, rows: int, utf8: bool, people: str
@@ -78,6 +82,30 @@ def test_a_person_with_unknown_heading_has_no_direction() -> None:
     row = row_of("Åsa", lines(shown, me=2))
     assert "13.0 m" in row
     assert not re.search("left|right|ahead|behind", row)
+
+
+def test_a_bearing_that_is_not_known_is_no_direction() -> None:
+    shown = team_view()
+    vague = tuple(replace(pair, sigma_bearing_rad=1.75) for pair in shown.pairs)
+    row = row_of("Åsa", lines(replace(shown, pairs=vague), me=2))
+    assert "13.0 m ±0.6" in row
+    assert not re.search("left|right|ahead|behind", row)
+
+
+@pytest.mark.parametrize("status", ["stale", "lost"])
+def test_whoever_is_not_heard_has_a_last_place_and_no_face(status: str) -> None:
+    silent = {"status": status, "seen_s": 75.0, "heading_rad": 0.0}
+    # My node is silent: where I face is not known, nor how far the others are now.
+    me_silent = lines(team_view(changes={2: silent}), me=2, columns=132, rows=40, heading_up=True)
+    row = row_of("Åsa", me_silent)[:75]
+    assert "last 13 m" in row
+    assert not re.search("left|right|ahead|behind|±", row)
+    assert any("up: y" in line for line in me_silent)
+    assert "2→" in "".join(lines(team_view(changes={2: {"heading_rad": 0.0}}), me=1, rows=40))
+    assert "2→" not in "".join(lines(team_view(changes={2: silent}), me=1, rows=40))
+    row = row_of("Kim", lines(team_view(changes={2: silent, 1: {"heading_rad": 0.0}}), me=1))
+    assert "last 13 m" in row
+    assert "left" in row
 
 
 def test_a_person_who_needs_help_is_on_top_in_words() -> None:
@@ -424,6 +452,17 @@ def test_a_terminal_that_is_gone_is_reported_and_ends_nothing() -> None:
     view.close()
     with suppress(OSError):
         screen.stream.close()
+
+
+def test_a_terminal_that_does_not_know_its_size_is_drawn_on(
+    screen: Screen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "get_terminal_size", lambda _: os.terminal_size((0, 0)))
+    view = TerminalView(2, stream=screen.stream, keys=False)
+    view.updated(team_view(1))
+    until(lambda: "node 4" in screen.rows()[5], "not everybody is drawn")
+    assert view.trouble() is None
+    view.close()
 
 
 def test_a_file_gets_plain_pages(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:

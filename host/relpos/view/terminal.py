@@ -126,6 +126,8 @@ class TerminalView(Sink):
         columns, rows = 100, len(view.people) + 26
         if self._screen:
             columns, rows = os.get_terminal_size(self._stream.fileno())
+            # A serial line does not know its size.
+            columns, rows = columns or 80, rows or 24
         console = Console(
             file=self._stream, force_terminal=self._screen or None, legacy_windows=False
         )

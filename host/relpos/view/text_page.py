@@ -28,6 +28,8 @@ BESIDE_COLUMNS = 118
 TABLE_COLUMNS = 79
 PAGE_S = 4.0
 """Where not everybody fits, the table turns its page so often; who needs help stays on top."""
+SILENT = frozenset(("stale", "lost"))
+"""Where somebody of this status stood and faced is known, not where they do."""
 STOREY_M = 1.5
 """Smaller height differences are within one storey."""
 
@@ -67,6 +69,8 @@ class _Seen:
     bearing_rad: float | None = None
     """Relative to where I face, counter-clockwise."""
     height_difference_m: float | None = None
+    is_last: bool = False
+    """One of the two is not heard: it leads to a last known place."""
     ways: tuple[tuple[float, float | None], ...] = ()
     """Distance and bearing in each possible view, the most probable first, where they differ."""
 
@@ -91,7 +95,7 @@ def page(view: TeamView, options: RenderOptions) -> list[Text]:
         if options.table:
             lines += _table(view, me, options, rows)
         left = options.rows - len(lines) - 1
-        if options.map and left >= 3:
+        if options.map:
             lines += _map(view, me, options, options.columns, left)
     lines = lines[: options.rows - 1]
     lines += [_line("", options) for _ in range(options.rows - 1 - len(lines))]
@@ -265,7 +269,7 @@ def _urgency(person: Person) -> int:
 
 def _state(person: Person) -> str:
     if person.post:
-        return "silent" if person.status in ("stale", "lost") else "post"
+        return "silent" if person.status in SILENT else "post"
     if person.alert is Alert.LOST or person.status == "lost":
         return "LOST"
     if person.alert is Alert.STILL_ALARM and not person.moving:
@@ -291,22 +295,29 @@ def _ago(seen_s: float | None) -> str:
 
 def _seen(person: Person, me: Person, view: TeamView) -> _Seen:
     """Return distance and direction from me; from the pair where there is one, with its sigma."""
-    facing = me.heading_rad
-    if me.sigma_heading_rad is None or me.sigma_heading_rad > HEADING_KNOWN_RAD:
-        facing = None
+    facing = _facing(me)
     ways = _ways(person.node, me.node, facing, view)
+    last = bool({person.status, me.status} & SILENT)
     pair = next((p for p in view.pairs if {p.node, p.peer} == {person.node, me.node}), None)
     height_difference = None if person.z_m is None or me.z_m is None else person.z_m - me.z_m
     if pair is not None:
         bearing = pair.bearing_rad if pair.node == me.node else pair.bearing_rad + math.pi
-        relative = None if facing is None else _wrapped(bearing - facing)
-        return _Seen(pair.distance_m, pair.sigma_distance_m, relative, height_difference, ways)
+        vague = math.hypot(pair.sigma_bearing_rad, me.sigma_heading_rad or 0.0) > HEADING_KNOWN_RAD
+        relative = None if facing is None or vague else _wrapped(bearing - facing)
+        sigma_m = pair.sigma_distance_m
+        return _Seen(pair.distance_m, sigma_m, relative, height_difference, last, ways)
     here, there = _xy(me), _xy(person)
     if here is None or there is None:
-        return _Seen(height_difference_m=height_difference, ways=ways)
+        return _Seen(height_difference_m=height_difference, is_last=last, ways=ways)
     dx, dy = there[0] - here[0], there[1] - here[1]
     relative = None if facing is None else _wrapped(math.atan2(dy, dx) - facing)
-    return _Seen(math.hypot(dx, dy), None, relative, height_difference, ways)
+    return _Seen(math.hypot(dx, dy), None, relative, height_difference, last, ways)
+
+
+def _facing(person: Person) -> float | None:
+    """Return where somebody faces now; None while it is not known."""
+    known = person.sigma_heading_rad is not None and person.sigma_heading_rad <= HEADING_KNOWN_RAD
+    return person.heading_rad if known and person.status not in SILENT else None
 
 
 def _ways(
@@ -354,6 +365,8 @@ def _distance(seen: _Seen, options: RenderOptions) -> str:
         return f"{first:.0f} or {second:.0f} m"
     if seen.distance_m is None:
         return "-"
+    if seen.is_last:
+        return f"last {seen.distance_m:.0f} m"
     if seen.sigma_m is None:
         return f"{seen.distance_m:.1f} m"
     # No decimetres where the standard deviation is a metre or more.
@@ -444,6 +457,8 @@ def _map(
     view: TeamView, me: Person | None, options: RenderOptions, columns: int, rows: int
 ) -> list[Text]:
     """Return the map: me in the middle, north (unknown: y) or where I face up, a scale below."""
+    if rows < 3:
+        return []
     canvas = Canvas(columns, rows - 1, utf8=options.utf8)
     middle = _xy(me) if me is not None else None
     places = {p.node: xy for p in view.people if (xy := _xy(p)) is not None}
@@ -456,8 +471,9 @@ def _map(
         return [_line("    (no position known yet)", options, "dim")]
     x0, y0 = middle
     turn = 0.0 if view.north_rad is None else 0.5 * math.pi - view.north_rad
-    if options.heading_up and me is not None and me.heading_rad is not None:
-        turn = 0.5 * math.pi - me.heading_rad
+    facing = _facing(me) if options.heading_up and me is not None else None
+    if facing is not None:
+        turn = 0.5 * math.pi - facing
     c, s = math.cos(turn), math.sin(turn)
     span_m = _span_m(canvas, [((x - x0), (y - y0)) for x, y in places.values()], options.zoom, turn)
     dots_per_m = 0.5 * min(canvas.width, canvas.height) / span_m
@@ -489,9 +505,10 @@ def _map(
             mark = {0: "!", 1: "!", 2: "!"}.get(_urgency(person), "")
             words = f"{person.node}{mark}" + _faces(person, turn, options)
             canvas.write(*_label(at(*places[person.node]), words))
+    up = "magnetic north" if view.north_rad is not None else "y"
+    up = "where I face" if facing is not None else up
     return [
-        _line(line, options)
-        for line in (*canvas.lines(), _scale(canvas, dots_per_m, options, view))
+        _line(line, options) for line in (*canvas.lines(), _scale(canvas, dots_per_m, options, up))
     ]
 
 
@@ -542,22 +559,20 @@ def _outline(shape: Person | GhostPerson) -> Iterable[tuple[float, float]]:
 
 def _faces(person: Person, turn: float, options: RenderOptions) -> str:
     """Return an arrow for where somebody faces, in UTF-8 and where it is known."""
-    known = person.sigma_heading_rad is not None and person.sigma_heading_rad < HEADING_KNOWN_RAD
-    if person.heading_rad is None or not known or not options.utf8:
+    facing = _facing(person)
+    if facing is None or not options.utf8:
         return ""
-    return _arrow(_wrapped(person.heading_rad + turn - 0.5 * math.pi), options)
+    return _arrow(_wrapped(facing + turn - 0.5 * math.pi), options)
 
 
-def _scale(canvas: Canvas, dots_per_m: float, options: RenderOptions, view: TeamView) -> str:
+def _scale(canvas: Canvas, dots_per_m: float, options: RenderOptions, up: str) -> str:
     """Return a scale bar of 1, 2 or 5 times a power of ten, at most a quarter of the width."""
     most_m = 0.25 * canvas.width / dots_per_m
     power = 10.0 ** math.floor(math.log10(most_m))
     length_m = next(f * power for f in (5.0, 2.0, 1.0) if f * power <= most_m)
     cells = max(round(length_m * dots_per_m / 2.0), 2)
     ends, line = ("├┤", "─") if options.utf8 else ("||", "-")
-    unturned = "y" if view.north_rad is None else "magnetic north"
-    up = "up: where I face" if options.heading_up else f"up: {unturned}"
-    return f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  {up}"
+    return f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  up: {up}"
 
 
 def _line(words: str, options: RenderOptions, style: str = "") -> Text:
