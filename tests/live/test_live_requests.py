@@ -78,6 +78,15 @@ def test_a_phones_compass_is_a_heading_of_its_node(handler):
     assert new == [Heading(pytest.approx(50.0), 2, 1.5, None, "phone")]
 
 
+def test_a_heading_whose_answer_was_lost_counts_once(handler):
+    rows = [{"unix_ms": unix_ms(k), "heading_rad": 1.5, "sigma_rad": 0.2} for k in (50.0, 51.0)]
+    for count, sent in ((1, rows[:1]), (1, rows), (0, rows)):
+        body = {"node": 2, "clock_offset_ms": 0.0, "sent_unix_ms": None, "headings": sent}
+        assert len(handler.headings(Request(2, "headings", STARTED_UNIX_S + 51.5, body))[1]) == count
+    body["node"] = 3
+    assert len(handler.headings(Request(2, "headings", STARTED_UNIX_S + 51.5, body))[1]) == 2
+
+
 @pytest.mark.parametrize("ms", [-1e305, -1e308, unix_ms(-200_000.0)])
 def test_a_press_of_another_age_is_dropped_counted_and_not_sent_again(handler, ms):
     for offset_ms, sent_ms in ((0.0, None), (0.0, unix_ms(9.0)), (ms, 1e308)):

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from team_input import TeamInput, make_session
+from team_input import TeamInput, make_session, run_through
 
 from relpos import fusion
 from relpos.cli import mission as command
@@ -285,6 +285,24 @@ def test_lines_of_a_journal_that_are_none_of_ours_cost_no_other_and_no_mission(t
         )
         session.keep(Journal(mission.path / JOURNAL), mission.resume())
     assert visitors.names == {1: "Anna"}
+
+
+def test_a_shelved_alarm_comes_back_in_time_where_the_laptops_clock_was_set(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    found = {"time_s": 0.0, "arrived_s": 0.0, "heard_s": {"1": 0.0}, "priors": []}
+    (mission.path / "checkpoint.json").write_text(json.dumps(found))
+    for set_s in (-3600.0, 3600.0):
+        event = {"kind": "shelve", "node": 1, "seconds": 60.0, "by": "Anna", "time_s": 0.0}
+        line = json.dumps(event | {"unix_s": time.time() + set_s})
+        (mission.path / JOURNAL).write_text(line + "\n")
+        with EmulatedTeam(TeamConfig("paper", 2, 5.0, 1)) as team:
+            session, album = make_session(
+                TeamInput(team), lambda p: fusion.make("deadreckoning", p)
+            )
+            session.keep(Journal(mission.path / JOURNAL), mission.resume())
+            run_through(session)
+        left_s = [p.shelved_s for view in album.views for p in view.people if p.node == 1]
+        assert 50.0 < max(left_s) <= 60.0
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,40 @@ def test_a_mayday_that_is_not_sent_says_so_and_does_not_vanish(
     context.close()
 
 
+def test_a_mayday_is_called_until_the_session_has_it_also_by_a_page_that_was_closed_meanwhile(
+    visit: Any, stage: Stage
+) -> None:
+    page = wearer(visit("/phone", expect_gone=True, **BY_HAND), "Anna")
+    wait_live(page)
+    page.route("**/api/mayday", lambda route: route.abort())
+    page.evaluate(PRESS)
+    words = page.locator("#mayday-words")
+    expect(words).to_contain_text("MAYDAY NOT SENT")
+    assert not stage.board.mayday
+    context = page.context
+    page.close()
+    page = visit("/phone", context=context)
+    wait_for(lambda: 1 in stage.board.mayday, 10.0)
+    expect(page.locator("#mayday-words")).to_have_text("MAYDAY was sent")
+    # Once: the commander has ended it, and the page is opened once more.
+    stage.set_board({"kind": "mayday", "node": 1, "on": False})
+    page.reload()
+    wait_live(page)
+    page.wait_for_timeout(1500)
+    assert not stage.board.mayday
+
+
+def test_a_page_that_is_opened_the_next_day_calls_no_mayday_of_the_day_before(
+    visit: Any, stage: Stage
+) -> None:
+    old = "Date.now() - 24 * 3600e3"
+    call = f"JSON.stringify({{ node: 1, by: 'Anna', unix_ms: {old} }})"
+    page = visit("/phone", init=f"localStorage.setItem('relpos.mayday', {call})", **BY_HAND)
+    wait_live(page)
+    page.wait_for_timeout(1500)
+    assert not stage.board.mayday
+
+
 def test_the_mayday_is_in_view_on_every_page_of_the_phone_and_hides_no_key(
     visit: Any, stage: Stage
 ) -> None:

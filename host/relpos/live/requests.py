@@ -47,7 +47,7 @@ class RequestSource(Protocol):
 
 
 class RequestHandler:
-    """Turns requests into observations; the same press counts once, however often it is sent.
+    """Turns requests into observations; the same press or heading counts once, however often sent.
 
     ``session_s`` converts a Unix time of the server's clock to the session's time.
     """
@@ -56,6 +56,8 @@ class RequestHandler:
         self._session_s = session_s
         self._accepted: dict[str, None] = {}
         """The newest ids, the oldest first."""
+        self._headings: dict[tuple[Any, ...], None] = {}
+        """The newest headings, likewise."""
         self.names: dict[int, str] = {}
         self.counts: Counter[str] = Counter()
         """What was refused, and what failed, by name."""
@@ -68,11 +70,8 @@ class RequestHandler:
         """Return the reply and the presses that are new."""
         new: list[Observation] = []
         for press in request.body["presses"]:
-            if press["id"] in self._accepted:
+            if not _is_new(self._accepted, press["id"]):
                 continue
-            if len(self._accepted) >= MAX_ACCEPTED:
-                del self._accepted[next(iter(self._accepted))]
-            self._accepted[press["id"]] = None
             time_s = self._time_s(request, press["unix_ms"])
             new.append(Event(time_s, request.body["node"], "landmark", press["landmark"]))
         new = self._believable("presses", new)
@@ -90,6 +89,7 @@ class RequestHandler:
                 "phone",
             )
             for row in request.body["headings"]
+            if _is_new(self._headings, (request.body["node"], *row.values()))
         ]
         new = self._believable("headings", new)
         return {"accepted": len(new)}, new
@@ -110,3 +110,13 @@ class RequestHandler:
                 server_s = request.unix_s - (sent_ms - unix_ms) * 1e-3
         # Nothing happens after it was reported.
         return self._session_s(min(server_s, request.unix_s))
+
+
+def _is_new(known: dict[Any, None], key: Any) -> bool:
+    """Note a key; False where it was known."""
+    if key in known:
+        return False
+    if len(known) >= MAX_ACCEPTED:
+        del known[next(iter(known))]
+    known[key] = None
+    return True

@@ -554,7 +554,7 @@ class LiveSession:
                     self._alerts[node].seen, self._alerts[node].by = True, event.get("by", "")
                 return self._composer.alarms.acknowledge(node, event.get("by", ""))
             case "shelve":
-                left_s = event["seconds"] - (time.time() - event["unix_s"])
+                left_s = event["seconds"] - (self._source.now_s() - event["time_s"])
                 return self._composer.alarms.shelve(node, left_s)
             case kind if kind in BOARD_EVENTS:
                 words = self._board.apply(event)

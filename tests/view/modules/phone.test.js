@@ -136,6 +136,19 @@ test("presses outlive the page until the server has them", () => {
   equal(new PressQueue(memory).presses.map((p) => p.id), ["id2"]);
 });
 
+test("two tabs of one browser lose none of each other's presses", () => {
+  const { queue, clock, memory } = queueAt();
+  const other = new PressQueue(memory, { now: () => clock.ms, newId: () => "other" });
+  queue.press(2, "17");
+  other.press(2, "18");
+  clock.ms += 6000;
+  queue.accepted(["id1"]);
+  equal(new PressQueue(memory).presses.map((p) => p.landmark), ["18"]);
+  equal(queue.batches(0)[0].presses.map((p) => p.landmark), ["18"]);
+  other.accepted(["other"]);
+  equal(queue.waiting, 0);
+});
+
 test("each press goes with the clock offset that was known when it was made", () => {
   const { queue, clock } = queueAt();
   queue.press(2, "1", 100);

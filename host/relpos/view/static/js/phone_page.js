@@ -28,6 +28,9 @@ const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
 const TROUBLE_MS = 60_000;
 const MAYDAY_AGAIN_MS = 2000;
+/** A page that is opened again so much later calls no more for whoever had it then. */
+const MAYDAY_KEPT_MS = 15 * 60_000;
+const MAYDAY = "relpos.mayday";
 
 const store = storage();
 const team = new Team();
@@ -124,8 +127,10 @@ function showOrders(board) {
   orders = board;
   const node = me?.node;
   // The session has it, whatever became of the answer.
-  if (board.mayday?.[node]) setText(byId("mayday-words"), t("mayday.sent"));
-  else if (maydayHad) setText(byId("mayday-words"), "");
+  if (board.mayday?.[node]) {
+    store.removeItem(MAYDAY);
+    setText(byId("mayday-words"), t("mayday.sent"));
+  } else if (maydayHad) setText(byId("mayday-words"), "");
   maydayHad = Boolean(board.mayday?.[node]);
   const { evacuation, roll_call: call } = board;
   const section = byId("orders");
@@ -564,21 +569,35 @@ function showCompass() {
 
 hold(byId("mayday"), () => {
   if (!me) return open("me");
-  setText(byId("mayday-words"), t("mayday.sending"));
+  // The phone's page may be closed, or its browser end, before the session has it.
+  store.setItem(MAYDAY, JSON.stringify({ node: me.node, by: me.name, unix_ms: Date.now() }));
   return callMayday(me.node, me.name);
 });
+
+/** Go on calling a MAYDAY that the session had not when the page was left. */
+function resumeMayday() {
+  try {
+    const { node, by, unix_ms: calledMs } = JSON.parse(store.getItem(MAYDAY) ?? "{}");
+    if (Math.abs(Date.now() - calledMs) < MAYDAY_KEPT_MS) callMayday(node, by);
+  } catch {
+    // Not ours.
+  }
+}
 
 /** Called until the session has it: whoever calls may have no hand for a second time. */
 async function callMayday(node, by) {
   clearTimeout(maydayTimer);
+  if (byId("mayday-words").textContent === "") setText(byId("mayday-words"), t("mayday.sending"));
   try {
     await postJson("/api/mayday", { node, on: true, by });
+    store.removeItem(MAYDAY);
     lastPress = null; // Else its line takes this one's place.
     setText(byId("last"), t("mayday.sent"));
     setText(byId("mayday-words"), t("mayday.sent"));
   } catch (error) {
     setText(byId("mayday-words"), maydayHad ? t("mayday.sent") : t("mayday.failed", { error: error.message }));
-    if (error.again) maydayTimer = setTimeout(() => maydayHad || callMayday(node, by), MAYDAY_AGAIN_MS);
+    if (!error.again) store.removeItem(MAYDAY);
+    else maydayTimer = setTimeout(() => maydayHad || callMayday(node, by), MAYDAY_AGAIN_MS);
   }
 }
 byId("marker-place").addEventListener("click", async () => {
@@ -632,6 +651,7 @@ const showSettings = () => {
   showClock();
 };
 showSettings();
+resumeMayday();
 languageSwitch(byId("language"), () => {
   showTheme();
   showSettings();

@@ -13,30 +13,34 @@ export class PressQueue {
     this.storage = storage;
     this.now = now;
     this.newId = newId;
-    this.presses = [];
     this.acknowledged = 0;
+  }
+
+  /** As they are stored: another tab of this browser has the same. */
+  get presses() {
+    const kept = this.storage.getItem(KEY);
     try {
-      const kept = JSON.parse(storage.getItem(KEY) ?? "[]");
-      this.presses = Array.isArray(kept) ? kept : [];
+      const presses = JSON.parse(kept ?? "[]");
+      return Array.isArray(presses) ? presses : [];
     } catch {
       // Unreadable presses cannot be sent: stored elsewhere instead of overwritten.
-      storage.setItem(`${KEY}.unreadable`, storage.getItem(KEY));
+      this.storage.setItem(`${KEY}.unreadable`, kept);
+      return [];
     }
   }
 
   press(node, landmark, offsetMs = null, unixMs = this.now()) {
     const press = { id: this.newId(), node, landmark, unix_ms: unixMs, offset_ms: offsetMs };
-    this.presses.push(press);
-    this.keep();
+    this.keep([...this.presses, press]);
     return press;
   }
 
   /** Undo the newest press; null where its five seconds are over. */
   undo() {
-    const last = this.presses[this.presses.length - 1];
+    const { presses } = this;
+    const last = presses.pop();
     if (!last || !this.isHeld(last)) return null;
-    this.presses.pop();
-    this.keep();
+    this.keep(presses);
     return last;
   }
 
@@ -73,14 +77,14 @@ export class PressQueue {
   /** Remove the presses that the server has confirmed. */
   accepted(ids) {
     const gone = new Set(ids);
-    const before = this.presses.length;
-    this.presses = this.presses.filter((press) => !gone.has(press.id));
-    this.acknowledged += before - this.presses.length;
-    this.keep();
+    const before = this.presses;
+    const left = before.filter((press) => !gone.has(press.id));
+    this.acknowledged += before.length - left.length;
+    this.keep(left);
   }
 
-  keep() {
-    this.storage.setItem(KEY, JSON.stringify(this.presses));
+  keep(presses) {
+    this.storage.setItem(KEY, JSON.stringify(presses));
   }
 }
 

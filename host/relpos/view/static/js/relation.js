@@ -1,5 +1,6 @@
 // How one person sees another: distance and direction with their standard deviations.
 
+import { isFresh } from "./age.js";
 import { relative, wrap } from "./angles.js";
 
 /** Standard deviation of a bearing of which nothing is known: a uniform angle's. */
@@ -49,8 +50,8 @@ function byPositions(from, to) {
  *
  * `pair` is the view's [node, peer, distance_m, sigma_distance_m, bearing_rad,
  * sigma_bearing_rad] of the two in either order, where it has one: it includes the correlation
- * of the two. `relativeRad` is null while the heading of `from` is unknown or the direction too
- * uncertain to show.
+ * of the two. `relativeRad` is null while the heading of `from` is unknown or not of now, or the
+ * direction too uncertain to show.
  */
 export function relation(from, to, pair = null) {
   if (!isPlaced(from) || !isPlaced(to) || from.node === to.node) return null;
@@ -58,7 +59,8 @@ export function relation(from, to, pair = null) {
   if (pair && pair[0] !== from.node) bearingRad = wrap(bearingRad + Math.PI);
   const sigmaHeadingRad = from.sigma_heading_rad ?? ANY_ANGLE_RAD;
   const sigmaRad = Math.min(Math.hypot(sigmaBearingRad, sigmaHeadingRad), ANY_ANGLE_RAD);
-  const shown = Number.isFinite(from.heading_rad) && sigmaRad < VAGUE_RAD;
+  const faces = isFresh(from) && Number.isFinite(from.heading_rad);
+  const shown = faces && sigmaRad < VAGUE_RAD;
   return {
     distanceM,
     sigmaM,
@@ -66,7 +68,7 @@ export function relation(from, to, pair = null) {
     sigmaBearingRad,
     relativeRad: shown ? relative(bearingRad, from.heading_rad) : null,
     sigmaRad,
-    headingKnown: Number.isFinite(from.heading_rad) && sigmaHeadingRad < VAGUE_RAD,
+    headingKnown: faces && sigmaHeadingRad < VAGUE_RAD,
   };
 }
 
