@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 import time
+from array import array
 from dataclasses import replace
 
 import pytest
@@ -22,6 +24,8 @@ from relpos.recording.moments import Moments
 from relpos.recording.output import Disk
 from relpos.recording.player import History, Player
 from relpos.recording.recorder import Recorder
+from relpos.simulation.building import simulate_building
+from support.waiting import until
 
 SEEK_S = 0.3
 
@@ -226,6 +230,44 @@ def test_alerts_of_a_moment_are_those_that_were_then():
     posts = History()
     posts.read(Rows(), {}, (), frozenset({2}))
     assert posts.alert(2, 42.0)[1] is None, "the command post's node lies still"
+
+
+def test_a_fall_is_an_alert_of_a_recording_too():
+    run = simulate_building("building-fall", 205, {"seconds": 120.0, "fall_s": 10.0})
+    ends_s = next(e.time_s for e in run.events if e.value == "lying")
+
+    class Rows:
+        started_unix_s, from_s, to_s = 0.0, 0.0, 120.0
+
+        def rows(self, _from_s, _to_s, *kinds):
+            return ((m.time_s, m) for m in run.measurements if isinstance(m, kinds))
+
+    history = History()
+    history.read(Rows(), {2: "Ben"}, ())
+    assert history.alert(2, ends_s + 3.0)[1] is Alert.FALL
+    assert any(e.text == "Ben fell" for e in history.events)
+
+
+def test_before_all_of_a_recording_is_read_nobody_is_called_silent_or_lying(recorded, monkeypatch):
+    path, _ = recorded
+    go_on = threading.Event()
+
+    def read(history, moments, *_):
+        # As far as it has come: somebody lay still then.
+        history.heard_s[1] = array("d", [1.0])
+        history.alerts[1] = [(1.0, Alert.STILL_ALARM)]
+        go_on.wait(30.0)
+        history.complete = True
+
+    monkeypatch.setattr(History, "read", read)
+    player = Player(Moments([path]), [Page()])
+    until(lambda: player.history.alerts, "the reading does not begin")
+    for complete in (False, True):
+        shown = next(p for p in player.view(12.0).people if p.node == 1)
+        assert (shown.alert is None) is not complete
+        assert (shown.seen_s is None) is not complete
+        go_on.set()
+        player.wait()
 
 
 @pytest.mark.soak

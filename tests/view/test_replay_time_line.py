@@ -65,3 +65,19 @@ def test_a_recording_is_moved_by_its_time_line(visit: Any, stage: Stage) -> None
     wait_for(lambda: drawn(page) < bare + 50)
     # The board and the devices belong to a live mission.
     expect(page.locator("#show-board")).to_be_hidden()
+
+
+def test_the_time_line_is_that_of_what_is_shown(visit: Any, stage: Stage) -> None:
+    stage.frozen = True
+    page = visit(expect_gone=True)
+    line = {"type": "timeline", "from_s": 0.0, "to_s": 100.0, "playing": False, "speed": 1.0,
+            "reading": False, "smoothing": False}  # fmt: skip
+    for recorded_unix_s, text in ((1.7e9, "Ben: still alarm"), (1.71e9, "Anna: lost")):
+        stage.play_recording(recorded_unix_s)
+        assert stage.web is not None
+        stage.web.timed({**line, "ticks": [[30.0, "alarm", text]]})
+        expect(page.locator(".tick")).to_have_attribute("title", text)
+    # A mission that is shown live again has none.
+    stage.play_recording(None)
+    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
+    expect(page.locator("#timeline")).to_be_hidden()

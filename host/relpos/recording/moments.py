@@ -19,7 +19,7 @@ from mcap.records import Channel, Chunk, Metadata
 
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate
-from relpos.measurements import Event, Motion, Range, Status
+from relpos.measurements import Event, Height, Motion, Range, Status
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.container import (
@@ -40,7 +40,7 @@ BACK_S = 10.0
 KEPT_BYTES = 32 << 20
 """Unpacked blocks in memory: minutes of a large team."""
 _LISTS = frozenset(topics.LISTS.values())
-_READ = _LISTS | {topics.ROWS[kind] for kind in (Motion, Event, Status, Range)}
+_READ = _LISTS | {topics.ROWS[kind] for kind in (Motion, Height, Event, Status, Range)}
 """Everything else (bytes of the port, drawings) is most of a recording."""
 
 
@@ -193,7 +193,7 @@ class Moments:
         return None
 
     def rows(self, from_s: float, to_s: float, *kinds: type) -> Iterator[tuple[float, Any]]:
-        """Yield decoded rows (motions, ranges, statuses, events) with the time they were there."""
+        """Yield decoded rows of these kinds with the time they were there."""
         for message in self.between(from_s, to_s, {topics.ROWS[kind] for kind in kinds}):
             row = _decoded(topics.decode_row, message)
             if row is not None:

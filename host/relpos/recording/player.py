@@ -33,7 +33,7 @@ from relpos.live.team_view import (
     name_of,
 )
 from relpos.live.tracks import Tracks
-from relpos.measurements import Event, Motion, Range, Status
+from relpos.measurements import Event, Height, Motion, Range, Status
 from relpos.recording.moments import BACK_S, Moments
 from relpos.runs.landmarks import PRESS
 from relpos.said import Said, refusal, said_of
@@ -58,14 +58,14 @@ class History:
         self.complete = False
 
     def heard(self, node: int, time_s: float) -> float | None:
-        """Return when a node was heard last, at that time."""
-        times = self.heard_s.get(node, array("d"))
+        """Return when a node was heard last, at that time; unknown before all is read."""
+        times = self.heard_s.get(node, array("d")) if self.complete else array("d")
         place = bisect_right(times, time_s)
         return times[place - 1] if place else None
 
     def alert(self, node: int, time_s: float) -> tuple[float, Alert | None]:
-        """Return the alert that a wearer had, and since when."""
-        changes = self.alerts.get(node, [])
+        """Return the alert that a wearer had, and since when; none before all is read."""
+        changes = self.alerts.get(node, []) if self.complete else []
         place = bisect_right(changes, time_s, key=lambda change: change[0])
         return changes[place - 1] if place else (0.0, None)
 
@@ -87,7 +87,7 @@ class History:
             unix_s = moments.started_unix_s + time_s
             log.append(LogEntry(time_s, unix_s, kind, str(words), node, said=said_of(words)))
 
-        kinds = (Motion, Event, Status)
+        kinds = (Motion, Height, Event, Status)
         ticked_s = -math.inf
         for time_s, row in moments.rows(moments.from_s, moments.to_s, *kinds):
             if isinstance(row, Event):
@@ -100,6 +100,8 @@ class History:
             alarms.mark_heard(row.node)
             if isinstance(row, Motion):
                 alarms.add_motion(row)
+            elif isinstance(row, Height):
+                alarms.add_height(row)
             if time_s < ticked_s + TICK_S:
                 continue
             ticked_s = time_s

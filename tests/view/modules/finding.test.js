@@ -83,3 +83,11 @@ test("an instruction is spoken when something has changed, and not too often", (
   ok(announcer.due(21000, { key: "left", distanceM: 17.5, trend: null }));
   ok(announcer.due(26000, { key: "left", distanceM: 17.5, trend: "warmer" }));
 });
+
+test("a recording that was moved back is warmer or colder by what comes then", () => {
+  const trend = new Trend();
+  for (let k = 0; k < 20; k += 1) trend.add(100 + 0.5 * k, 20 - 0.5 * k);
+  equal(trend.direction, "warmer");
+  for (let k = 0; k < 20; k += 1) trend.add(30 + 0.5 * k, 5 + 0.5 * k);
+  equal(trend.direction, "colder");
+});

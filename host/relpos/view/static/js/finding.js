@@ -63,7 +63,9 @@ export class Trend {
 
   add(timeS, distanceM) {
     const last = this.samples[this.samples.length - 1];
-    if (last && timeS <= last[0]) return;
+    if (timeS === last?.[0]) return;
+    // A recording that was moved back.
+    if (timeS < last?.[0]) this.samples = [];
     this.samples.push([timeS, distanceM]);
     while (this.samples[0][0] < timeS - TREND_S) this.samples.shift();
   }

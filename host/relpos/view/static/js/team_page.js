@@ -85,6 +85,7 @@ function handle(message, ageS) {
     trouble = null;
     alarms.clear();
     log.clear();
+    timeline.clear();
     setText(byId("session"), team.session.emulated ? t("session.emulated", { name: team.session.name }) : team.session.name);
     link.setTitle(t(team.replayed ? "title.replay" : "title.live", { name: team.session.name ?? "" }));
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);

@@ -33,6 +33,14 @@ export class Timeline {
     });
   }
 
+  /** Another session, or the same once more: what was of the one before is gone. */
+  clear() {
+    this.line = null;
+    this.dragging = false;
+    this.ready(false);
+    byId("timeline").hidden = true;
+  }
+
   handle(line) {
     const ticks = this.line?.ticks?.length !== line.ticks.length;
     this.line = line;
