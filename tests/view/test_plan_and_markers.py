@@ -65,6 +65,59 @@ def test_a_plan_is_laid_under_the_map_and_aligned_by_two_points_with_the_residua
     expect(other.locator("#plan-align")).to_be_disabled()
 
 
+def upload(page: Page, path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+    page.locator("#plan-file").set_input_files(path)
+
+
+def test_points_of_one_plan_never_align_another(visit: Any, stage: Stage, tmp_path: Path) -> None:
+    page, other = visit(viewport={"width": 1366, "height": 768}), visit()
+    page.locator("#layers summary").click()
+    upload(page, tmp_path / "one.png", png(600, 400))
+    expect(page.locator("#plan-align")).to_be_enabled()
+    page.locator("#plan-align").click()
+    status = page.locator("#ground-status")
+    for x, y in ((400, 300), (400, 300), (700, 500)):
+        click(page, x, y)
+    expect(status).to_contain_text("2nd point is on the map")
+    assert stage.board.plan is not None
+    before = stage.board.plan.image
+    upload(other, tmp_path / "two.png", png(300, 200))
+    wait_for(lambda: stage.board.plan is not None and stage.board.plan.image != before)
+    page.wait_for_timeout(500)
+    click(page, 700, 500)
+    expect(status).to_be_hidden()
+    page.wait_for_timeout(500)
+    assert stage.board.plan.points == []
+    # Nor on its way to the session.
+    late = {"action": "align", "image": before, "points": [[0, 0, 1, 1], [9, 9, 5, 5]]}
+    with pytest.raises(BoardError, match="there is no plan"):
+        stage.board.apply({"kind": "plan", "by": "", "unix_s": 1.0, **late})
+
+
+def test_the_plan_is_the_last_one_also_where_the_one_before_was_slower(
+    visit: Any, stage: Stage, tmp_path: Path
+) -> None:
+    page, other = visit(viewport={"width": 1366, "height": 768}), visit()
+    late: list[Any] = []
+    page.route("**/api/image/*", lambda r: r.continue_() if late else late.append(r))
+    # Black and white: where the plan lies the map is grey, or as bright as it was.
+    with page.expect_request("**/api/image/*"):
+        upload(other, tmp_path / "black.png", png(6, 6))
+    upload(other, tmp_path / "large.png", png(700, 700))
+    expect(page.locator("#plan-align")).to_be_enabled()
+    page.wait_for_timeout(300)
+    stage.frozen = True
+    page.wait_for_timeout(300)
+    dark = """() => { const c = document.getElementById("map");
+        const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data; let n = 0;
+        for (let k = 0; k < d.length; k += 4) n += d[k] + d[k + 1] + d[k + 2] < 540; return n; }"""
+    few = page.evaluate(dark)
+    late[0].fulfill(body=png(6, 6), content_type="image/png")
+    page.wait_for_timeout(700)
+    assert page.evaluate(dark) < 1.5 * few
+
+
 def test_markers_are_set_by_key_and_from_a_phone_and_removed(visit: Any, stage: Stage) -> None:
     page = visit(viewport={"width": 1366, "height": 768})
     phone = visit("/phone", viewport={"width": 390, "height": 844})

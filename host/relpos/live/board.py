@@ -288,7 +288,8 @@ class Board:
                 raise BoardError("image: not the name of an image")
             self.plan = Plan(image)
             return Said("plan", "{whom}a plan lies under the map", whom="")
-        if self.plan is None:
+        # A page may have measured on the one before.
+        if self.plan is None or event.get("image", self.plan.image) != self.plan.image:
             raise BoardError(Said("without-plan", "there is no plan"))
         if action == "remove":
             self.plan = None

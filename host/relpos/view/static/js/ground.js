@@ -68,6 +68,7 @@ export class Ground {
     this.before = this.transform;
     this.map.setCamera("free");
     this.points = [];
+    this.aligned = this.plan.image;
     this.pair();
   }
 
@@ -80,13 +81,15 @@ export class Ground {
   }
 
   paired(point) {
+    // Somebody has laid another plan there meanwhile, of other pixels.
+    if (this.plan?.image !== this.aligned) return this.stop();
     this.points.push(point);
     const found = align(this.points);
     if (this.points.length === 2 && !found) {
       this.points = [];
       return this.stop(t("plan.one-point"));
     }
-    if (this.points.length >= 2) this.post("plan", { action: "align", points: this.points });
+    if (this.points.length >= 2) this.post("plan", { action: "align", image: this.aligned, points: this.points });
     if (this.points.length === 3) return this.stop(t("plan.residual", { distance: distance(found.residualM) }));
     // The third one is clicked on the plan where two have put it.
     if (found) this.before = found;
@@ -102,15 +105,18 @@ export class Ground {
       if (plan) {
         const image = new Image();
         image.onload = () => {
+          if (this.plan?.image !== plan.image) return; // A later one was quicker.
           this.image = image;
           this.default = provisional(this.map.view, image.width, image.height);
+          byId("plan-align").disabled = false;
           this.map.invalidate();
         };
         image.src = `/api/image/${plan.image}`;
       }
     }
     this.plan = plan;
-    byId("plan-align").disabled = byId("plan-remove").disabled = !plan;
+    byId("plan-align").disabled = !this.image;
+    byId("plan-remove").disabled = !plan;
     const list = Object.entries(markers).map(([id, { sign, by, unix_s: unixS }]) => {
       const remove = make("button", { type: "button", "data-t": "marker.remove", "aria-label": t("marker.remove.of", { sign: t(`marker.${sign}`) }) });
       remove.addEventListener("click", () => this.post("marker", { action: "remove", id }));
