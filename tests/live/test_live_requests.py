@@ -1,5 +1,7 @@
 """What phones send: whose time counts, and that nothing counts twice."""
 
+from dataclasses import replace
+
 import pytest
 
 from relpos.live.requests import Request, RequestHandler
@@ -82,9 +84,9 @@ def test_a_heading_whose_answer_was_lost_counts_once(handler):
     rows = [{"unix_ms": unix_ms(k), "heading_rad": 1.5, "sigma_rad": 0.2} for k in (50.0, 51.0)]
     for count, sent in ((1, rows[:1]), (1, rows), (0, rows)):
         body = {"node": 2, "clock_offset_ms": 0.0, "sent_unix_ms": None, "headings": sent}
-        assert len(handler.headings(Request(2, "headings", STARTED_UNIX_S + 51.5, body))[1]) == count
-    body["node"] = 3
-    assert len(handler.headings(Request(2, "headings", STARTED_UNIX_S + 51.5, body))[1]) == 2
+        request = Request(2, "headings", STARTED_UNIX_S + 51.5, body)
+        assert len(handler.headings(request)[1]) == count
+    assert len(handler.headings(replace(request, body=body | {"node": 3}))[1]) == 2
 
 
 @pytest.mark.parametrize("ms", [-1e305, -1e308, unix_ms(-200_000.0)])

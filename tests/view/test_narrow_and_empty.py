@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
 from playwright.sync_api import expect
 from stage import Stage, wait_live
 from walking_team import WalkingTeam
@@ -82,3 +83,24 @@ def test_who_may_only_look_has_no_mayday_to_press(visit: Any, stage: Stage) -> N
     expect(mayday).to_be_visible()
     page.evaluate("document.documentElement.dataset.role = 'look'")
     expect(mayday).to_be_hidden()
+    # The board is read, and has nothing that would be refused.
+    page.locator("#show-board").click()
+    expect(page.locator("#board-rows tr")).to_have_count(6)
+    expect(page.locator("#board-dialog button:visible")).to_have_text(["Close"])
+    enabled = "#board-rows :is(input, select):enabled"
+    expect(page.locator(enabled)).to_have_count(0)
+
+
+@pytest.mark.parametrize("path", ["/", "/phone"])
+def test_no_alarm_is_cut_on_the_narrowest_screen_in_german(
+    visit: Any, stage: Stage, path: str
+) -> None:
+    stage.team.still_since = {2: stage.at_s - 64.0}
+    stage.team.lost_since = {1: stage.at_s - 200.0}
+    stage.team.names = {1: "Hauptbrandmeister Anna-Lena"}
+    page = visit(path, viewport={"width": 320, "height": 568}, locale="de-DE")
+    texts = page.locator(".alarms .rows .text")
+    expect(texts).to_have_count(2)
+    for text in texts.all():
+        assert text.evaluate("(e) => e.scrollHeight <= e.clientHeight + 1"), text.inner_text()
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0

@@ -424,6 +424,17 @@ def test_find_leads_by_arrow_distance_and_words(visit, stage: Stage):
     expect(find_button(page, "Chloé")).to_be_focused()
 
 
+def test_an_arrow_to_one_of_several_places_is_hollow(visit, stage: Stage):
+    page = visit()
+    page.locator("#me").select_option("1")
+    page.locator("#people").get_by_role("button", name="Find Ben").click()
+    arrow = page.locator("#find .big-arrow path")
+    expect(arrow).not_to_have_css("fill", "none")
+    stage.team.ambiguous = 2
+    expect(page.locator("#find .caution")).to_contain_text("Ben may be elsewhere: 62 %")
+    expect(arrow).to_have_css("fill", "none")
+
+
 def test_find_says_that_the_direction_is_unknown(visit, stage: Stage):
     stage.team.ring = 1
     page = visit()

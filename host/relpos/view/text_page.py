@@ -317,7 +317,7 @@ def _seen(person: Person, me: Person, view: TeamView) -> _Seen:
 def _facing(person: Person) -> float | None:
     """Return where somebody faces now; None while it is not known."""
     known = person.sigma_heading_rad is not None and person.sigma_heading_rad <= HEADING_KNOWN_RAD
-    return person.heading_rad if known and person.status not in SILENT else None
+    return person.heading_rad if known and person.status not in SILENT and not person.post else None
 
 
 def _ways(

@@ -36,12 +36,14 @@ const person = (node, x_m, y_m, more = {}) => ({
   sigma_angle_rad: 0, status: "ok", ...more,
 });
 
-test("whoever is not heard faces nowhere that is known", () => {
+test("whoever is not heard, or is nobody, faces nowhere that is known", () => {
   for (const status of ["stale", "lost"]) {
     const seen = relation(person(1, 0, 0, { status, seen_s: 20 }), person(2, 4, 0));
     equal([seen.relativeRad, seen.headingKnown, seen.distanceM], [null, false, 4]);
     near(relation(person(2, 4, 0), person(1, 0, 0, { status, seen_s: 20 })).relativeRad, Math.PI);
   }
+  // Nor does the command post's node, which lies on a table.
+  equal(relation(person(1, 0, 0, { post: true }), person(2, 4, 0)).relativeRad, null);
 });
 
 test("a pair in the other order has the opposite bearing", () => {

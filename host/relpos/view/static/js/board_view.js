@@ -87,6 +87,7 @@ export class BoardView {
       setAttribute(row.element, "data-state", place.state ?? "");
       for (const name of FIELDS) {
         setAttribute(row[name], "aria-label", t(`board.${name}.of`, { node: person.node }));
+        row[name].disabled = document.documentElement.dataset.role === "look";
         const value = name === "air" ? place.air_bar ?? "" : place[name] ?? "";
         if (!row.edited.has(row[name]) && row[name].value !== String(value)) row[name].value = value;
       }

@@ -59,7 +59,7 @@ export function relation(from, to, pair = null) {
   if (pair && pair[0] !== from.node) bearingRad = wrap(bearingRad + Math.PI);
   const sigmaHeadingRad = from.sigma_heading_rad ?? ANY_ANGLE_RAD;
   const sigmaRad = Math.min(Math.hypot(sigmaBearingRad, sigmaHeadingRad), ANY_ANGLE_RAD);
-  const faces = isFresh(from) && Number.isFinite(from.heading_rad);
+  const faces = isFresh(from) && !from.post && Number.isFinite(from.heading_rad);
   const shown = faces && sigmaRad < VAGUE_RAD;
   return {
     distanceM,
