@@ -383,6 +383,22 @@ def test_a_request_is_taken_as_the_kind_that_its_device_was_allowed(kind):
     assert not getattr(phones, "board", {}).get("evacuation")
 
 
+def test_a_marker_where_i_am_is_set_nowhere_while_my_node_is_silent():
+    here = {"action": "set", "sign": "hazard", "node": 1}
+    with EmulatedTeam(TeamConfig("straight", 2, 40.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        source.unplug(9.0, 30.0)
+        phones = Phones(
+            source,
+            (8.0, Request(1, "marker", 8.0, {**here, "id": "a"})),
+            (30.0, Request(2, "marker", 30.0, {**here, "id": "b"})),
+        )
+        session, _ = make_session(source, deadreckoning, phones, common=True)
+        run_through(session)
+    assert [(i, status) for i, _, status in phones.answers] == [(1, 200), (2, 409)]
+    assert list(phones.board["markers"]) == ["a"]
+
+
 def test_a_mayday_that_is_called_again_leaves_the_answers_of_the_roll_call():
     with EmulatedTeam(TeamConfig("straight", 3, 16.0, 3, beacons=True)) as team:
         source = TeamInput(team)

@@ -126,10 +126,35 @@ class Composer:
             sigma_north_rad=None if self._north is None else self._north.sigma_rad,
             ambiguous=estimate is not None and bool(estimate.alternatives),
             notices=tuple(notices),
-            people=tuple(self._person(node, now_s) for node in people),
+            people=tuple(self.person(node, now_s) for node in people),
             pairs=() if estimate is None else self._pairs(estimate),
             ranges=self._measured(now_s),
             alternatives=() if estimate is None else ghosts_of(estimate),
+        )
+
+    def person(self, node: int, now_s: float) -> Person:
+        """Return a person as the view of this moment has them."""
+        monitor = self.monitor.nodes.get(node)
+        condition = self.alarms.condition(node)
+        seen_s = None if monitor is None else now_s - monitor.heard_s
+        at = self.nowcast.node(node)
+        return Person(
+            node=node,
+            name=self.name(node),
+            status=_status(at, seen_s, condition),
+            motion_s=self.nowcast.newest_s(node),
+            seen_s=seen_s,
+            moving=condition.moving,
+            still_s=condition.still_s,
+            alert=condition.alert,
+            acknowledged=condition.acknowledged,
+            acknowledged_by=condition.acknowledged_by,
+            shelved_s=condition.shelved_s,
+            rssi_dbm=None if monitor is None else monitor.rssi_dbm,
+            post=node in self.posts,
+            episode=None if at is None or at.episode is None else str(at.episode),
+            **self._health(node, now_s),
+            **({} if at is None else {name: getattr(at, name) for name in POSE}),
         )
 
     def remember(self, node: int, heard_s: float, now_s: float, alert: KnownAlert | None) -> None:
@@ -203,30 +228,6 @@ class Composer:
         }
         self._health_cache[node] = now_s, known
         return known
-
-    def _person(self, node: int, now_s: float) -> Person:
-        monitor = self.monitor.nodes.get(node)
-        condition = self.alarms.condition(node)
-        seen_s = None if monitor is None else now_s - monitor.heard_s
-        at = self.nowcast.node(node)
-        return Person(
-            node=node,
-            name=self.name(node),
-            status=_status(at, seen_s, condition),
-            motion_s=self.nowcast.newest_s(node),
-            seen_s=seen_s,
-            moving=condition.moving,
-            still_s=condition.still_s,
-            alert=condition.alert,
-            acknowledged=condition.acknowledged,
-            acknowledged_by=condition.acknowledged_by,
-            shelved_s=condition.shelved_s,
-            rssi_dbm=None if monitor is None else monitor.rssi_dbm,
-            post=node in self.posts,
-            episode=None if at is None or at.episode is None else str(at.episode),
-            **self._health(node, now_s),
-            **({} if at is None else {name: getattr(at, name) for name in POSE}),
-        )
 
 
 def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> MagneticNorth | None:

@@ -21,7 +21,7 @@ from typing import Any
 
 from relpos.fusion.clocks import time_offsets
 from relpos.fusion.estimator import Estimate, NodeStatus
-from relpos.live.alarms import CLEARED, RAISED, KnownAlert
+from relpos.live.alarms import CLEARED, LOST_S, RAISED, KnownAlert
 from relpos.live.board import BOARD_EVENTS, Board, BoardError
 from relpos.live.clock import SessionClock
 from relpos.live.composer import Composer
@@ -497,9 +497,10 @@ class LiveSession:
         said = {name: body[name] for name in BOARD_EVENTS[kind] if name in body}
         body = {"nodes": everybody, **said, "by": body.get("by", "")}
         if kind == "marker" and "x_m" not in body and body.get("action") == "set":
-            # "Here", of a wearer's phone.
-            at = self._composer.nowcast.node(body.get("node", 0))
-            if at is None or at.status not in (NodeStatus.OK, NodeStatus.STALE):
+            # "Here", of a wearer's phone; their node may be silent although the phone is not.
+            at = self._composer.person(body.get("node", 0), self._source.now_s())
+            silent = at.seen_s is None or at.seen_s > LOST_S
+            if silent or at.status not in (NodeStatus.OK, NodeStatus.STALE):
                 return refusal(Said("where", "where you are is not known yet")), 409
             body |= {"x_m": at.x_m, "y_m": at.y_m}
         again = kind == "mayday" and body.get("node") in self._board.mayday

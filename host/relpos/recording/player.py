@@ -48,13 +48,12 @@ TICK_KINDS = ("alarm", "landmark", "rollcall", "mayday", "evacuate", "note", "wa
 
 
 class History:
-    """What one reading of the recording finds: who was heard when, alerts, events, tracks."""
+    """What one reading of the recording finds: who was heard when, alerts, events."""
 
     def __init__(self) -> None:
         self.heard_s: dict[int, array[float]] = {}
         self.alerts: dict[int, list[tuple[float, Alert | None]]] = {}
         self.events: list[LogEntry] = []
-        self.tracks = Tracks()
         self.complete = False
 
     def heard(self, node: int, time_s: float) -> float | None:
