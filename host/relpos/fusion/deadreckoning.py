@@ -73,6 +73,7 @@ class DeadReckoning:
             [p.node for p in self.priors],
             reorder_s=self.settings.reorder_s,
             max_lag_s=self.settings.max_lag_s,
+            lazy=True,
         )
         for p in by_node(self.priors):
             sigma = (p.sigma_m, p.sigma_m, p.sigma_rad) if p.is_known else (0.0, 0.0, 0.0)

@@ -32,6 +32,9 @@ MOST_PANELS = 15
 MANY_DOTS = 3000
 """More dots than this become pixels: a page of a long session stays a few megabytes."""
 
+MANY_POINTS = 100_000
+"""Lines of a figure that have more points together than this become pixels, too."""
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -52,7 +55,16 @@ class Picture:
         with _styled():
             made = Figure(figsize=self.size_in, layout="constrained")
             self.draw(made)
+        curves = [curve for axes in made.axes for curve in (*axes.lines, *axes.collections)]
+        if sum(map(_points, curves)) > MANY_POINTS:
+            for curve in curves:
+                curve.set_rasterized(_points(curve) > MANY_POINTS // 1000)
         return made
+
+
+def _points(curve: Any) -> int:
+    paths = curve.get_paths() if hasattr(curve, "get_paths") else (curve.get_path(),)
+    return sum(len(path.vertices) for path in paths)
 
 
 @contextmanager
