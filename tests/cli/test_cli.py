@@ -346,6 +346,19 @@ def test_deadreckon_sums_what_the_firmware_reported(
     assert len(written.steps) == 2
 
 
+def test_deadreckon_writes_the_truth_that_its_run_starts_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "imu.csv").write_text(f"time_s,node,{IMU_COLUMNS}\n0,1,0,0,9.8,0,0,0,,,\n")
+    (tmp_path / "run.toml").write_text('initial_pose = "from truth"\n')
+    (tmp_path / "truth.csv").write_text("time_s,node,x_m,y_m,heading_rad\n0,1,3,4,0.5\n")
+    monkeypatch.setattr("relpos.emulator.deadreckoning.reckon_run", lambda *_, **__: {})
+    result = relpos("deadreckon", tmp_path, "--out", tmp_path / "o")
+    assert result.exit_code == 0, result.stderr
+    (start,) = load_run(tmp_path / "o").priors
+    assert (start.x_m, start.y_m) == (3.0, 4.0)
+
+
 def test_deadreckon_plays_unsorted_gzipped_rows_of_several_nodes_without_magnetometer(
     tmp_path: Path,
 ) -> None:

@@ -82,6 +82,7 @@ def deadreckon(
                 steps=tuple(
                     sorted((s for part in parts for s in part.steps), key=lambda s: s.time_s)
                 ),
+                truth=recording.truth,
             ),
             out,
         )

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from relpos.runs import Run
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Every figure of one estimate against a run's truth; ``print`` shows the main ones.
 
@@ -55,6 +55,10 @@ class Evaluation:
             "bound": None if (bound := self.bound) is None else asdict(bound),
             "vertical": summary.vertical_as_json(self.vertical),
         }
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all figures are the same."""
+        return isinstance(other, Evaluation) and self.as_json() == other.as_json()
 
     def __str__(self) -> str:
         """Return the main figures, one a line."""

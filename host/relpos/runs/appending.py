@@ -26,7 +26,7 @@ MOST_WAITING_BYTES = 64 << 20
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
     with open_output(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
+        text = io.TextIOWrapper(file, "utf-8", "replace", newline="", write_through=True)
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(header)
         writer.writerows([_cell(value) for value in row] for row in rows)

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cached_property
 from itertools import accumulate, chain
 from operator import attrgetter
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from relpos.errors import DataError
+from relpos.files import displayable, write_whole
 from relpos.measurements import (
     MEASUREMENTS,
     Event,
@@ -35,6 +37,7 @@ from relpos.runs.description import (
     Description,
     InitialPose,
     NodeInfo,
+    description_text,
     read_description,
     write_description,
 )
@@ -89,7 +92,7 @@ class Run:
     directory: Path | None = None
     counters: Mapping[str, int] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def node_ids(self) -> tuple[int, ...]:
         """Every node that moves, ranges, is ranged to or is described, in order."""
         ids = set(self.description.nodes)
@@ -269,7 +272,9 @@ def save_run(run: Run, path: Path | str) -> None:
             raise DataError(f"{directory}: not written: {name} cannot be read back: {row}")
     directory.mkdir(parents=True, exist_ok=True)
     description = replace(run.description, name=run.name)
-    write_description(directory / "run.toml", description)
+    # What is no text, as of a folder's name that is not UTF-8, is "?".
+    text = displayable(description_text(description))
+    write_whole(directory / "run.toml", text.encode())
     for table in _TABLES:
         remove_table(directory, table.name)
         if rows := by_kind[table.kind]:
