@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import relpos
+from relpos.evaluation.result import read_result
+from relpos.measurements import Event
 
 
 @pytest.fixture(scope="module")
@@ -217,3 +219,37 @@ def test_a_number_that_cannot_be_read_back_is_not_saved(run: relpos.Run, tmp_pat
     with pytest.raises(relpos.DataError, match="sigma_x_m cannot be read back"):
         relpos.save(replace(run, measurements=(unknown,)), tmp_path)
     assert relpos.load(tmp_path).measurements == run.measurements
+
+
+def test_an_estimate_that_is_read_is_scored_from_the_start_that_it_was_fused_from(
+    run: relpos.Run, tmp_path: Path
+) -> None:
+    for initial, known in (("truth", True), ("common", False)):
+        result = relpos.fuse(run, "deadreckoning", initial=initial)
+        result.save(tmp_path)
+        here, there = relpos.evaluate(result, run), relpos.evaluate(tmp_path, run)
+        assert (there.nees_position is not None) is (here.nees_position is not None) is known
+        assert set(there.iso.frames) == set(here.iso.frames)
+        assert read_result(tmp_path).priors == result.priors
+    vague = (relpos.Prior(1, 0.1 + 0.2, 2.0, 0.5, math.inf, 0.25),)
+    replace(result, priors=vague).save(tmp_path)
+    assert read_result(tmp_path).priors == vague
+    replace(result, priors=()).save(tmp_path)
+    assert read_result(tmp_path).priors == ()
+    replace(result, priors=None).save(tmp_path)
+    assert read_result(tmp_path).priors is None
+
+
+def test_evaluations_of_the_same_estimates_are_equal(
+    run: relpos.Run, result: relpos.Result
+) -> None:
+    assert relpos.evaluate(result, run) == relpos.evaluate(result, run)
+    other = relpos.fuse(run, "deadreckoning")
+    assert relpos.evaluate(other, run) != relpos.evaluate(result, run)
+
+
+def test_texts_that_are_none_are_saved_with_question_marks(run: relpos.Run, tmp_path: Path) -> None:
+    pressed = Event(1.0, 1, "land\udcff")
+    relpos.save(replace(run, name="walk\udcff", events=(pressed,)), tmp_path)
+    saved = relpos.load(tmp_path)
+    assert (saved.name, saved.events[0].event) == ("walk?", "land?")

@@ -130,8 +130,8 @@ class Result:
     """An estimator's estimates of one run: what ``fuse`` returns and ``evaluate`` scores.
 
     ``parameters`` are the learned values, a row for each change. ``priors`` are the starts that
-    the estimator began with. ``priors`` and ``estimator_run`` are None for a result that was read
-    from files.
+    the estimator began with. For a result that was read from files ``estimator_run`` is None,
+    and ``priors`` where they do not tell.
     """
 
     estimator: str
@@ -178,7 +178,7 @@ class Result:
         """Write the run format's files (``estimate.csv``, ...); return their paths."""
         from relpos.runs import write_estimates
 
-        return write_estimates(directory, self.estimates, steps=steps)
+        return write_estimates(directory, self.estimates, steps=steps, priors=self.priors)
 
     def _rows(self, table: str) -> list[tuple[Any, ...]]:
         if table == "poses":
@@ -226,10 +226,10 @@ def result_of(
 
 def read_result(directory: Path | str) -> Result:
     """Read the files of an estimate; DataError where they are faulty."""
-    from relpos.runs import read_estimates
+    from relpos.runs import read_estimates, read_initial
 
     estimates = tuple(read_estimates(directory))
-    return Result("estimate", estimates, _learned(estimates))
+    return Result("estimate", estimates, _learned(estimates), priors=read_initial(directory))
 
 
 def _learned(estimates: Sequence[Estimate]) -> tuple[Parameter, ...]:

@@ -14,7 +14,7 @@ from relpos.errors import DataError
 from relpos.exchange.formats import Kind
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import Locate, MapFrame
-from relpos.measurements import Truth
+from relpos.measurements import Prior, Truth
 from relpos.runs.run import Run
 from relpos.tracks import Track, sample
 
@@ -39,7 +39,8 @@ class Content:
 
     ``start_unix_s`` is the Unix time of the run's second 0, None where it is not known.
     ``remarks`` tell the user how it was read. ``recording`` is the MCAP
-    file that the run, and all estimates, were read from, with whatever else it holds.
+    file that the run, and all estimates, were read from, with whatever else it holds. ``priors``
+    are the starts of the estimates, None where they do not say.
     """
 
     run: Run
@@ -47,6 +48,7 @@ class Content:
     start_unix_s: float | None = None
     remarks: tuple[str, ...] = ()
     recording: Recording | None = None
+    priors: tuple[Prior, ...] | None = None
 
     @property
     def node_ids(self) -> tuple[int, ...]:
@@ -93,6 +95,8 @@ class Content:
     @property
     def one_frame(self) -> bool:
         """Whether estimates and truth have one frame, as where the starts were given."""
+        if self.priors is not None:
+            return bool(self.priors)
         return bool(self.run.description.priors) or self.run.description.initial_pose != "unknown"
 
 

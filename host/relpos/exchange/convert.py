@@ -24,7 +24,7 @@ from relpos.exchange.times import iso_of, possible
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.measurements import BOUNDS, Truth, out_of_bounds
 from relpos.recording import is_recording, open_recording, save_recording
-from relpos.runs.estimates import read_estimates, write_estimates
+from relpos.runs.estimates import read_estimates, read_initial, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
 from relpos.runs.run import RECEIVED, TABLE_NAMES, Run, holds_run, load_run, save_run
 from relpos.runs.table import MOST_WHOLE, find_table, remove_table
@@ -36,6 +36,7 @@ _ESTIMATE_TABLES = (
     "pairs.csv",
     "alternatives.csv",
     "parameters.csv",
+    "initial.csv",
     "summary.json",
 )
 
@@ -101,15 +102,20 @@ def _base(source: Path, hints: Hints) -> Content:
 
 def _read_directory(source: Path, hints: Hints) -> Content:
     estimates = tuple(read_estimates(source)) if find_table(source, "estimate.csv") else ()
+    priors = read_initial(source) if estimates else None
     if hints.run is not None:
         base = _base(source, hints)
-        return replace(base, estimates=estimates, recording=None) if estimates else base
+        return (
+            base
+            if not estimates
+            else replace(base, estimates=estimates, priors=priors, recording=None)
+        )
     received = source / RECEIVED
     if estimates and received.is_dir():
         run = load_run(received)
-        return Content(replace(run, name=source.resolve().name), estimates)
+        return Content(replace(run, name=source.resolve().name), estimates, priors=priors)
     run = load_run(source)
-    return Content(run, estimates, remarks=_press_remarks(run))
+    return Content(run, estimates, remarks=_press_remarks(run), priors=priors)
 
 
 def _press_remarks(run: Run) -> tuple[str, ...]:
@@ -330,7 +336,7 @@ def _remove_old(out: Path, form: Format) -> None:
 def _write_run(content: Content, out: Path) -> _Written:
     save_run(content.run, out)
     if content.estimates:
-        write_estimates(out, content.estimates, steps=content.run.steps)
+        write_estimates(out, content.estimates, steps=content.run.steps, priors=content.priors)
     return sorted(path for path in out.iterdir() if path.is_file()), []
 
 

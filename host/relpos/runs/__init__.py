@@ -13,6 +13,7 @@ from relpos.runs.estimates import (
     EstimateFiles,
     drop_page,
     read_estimates,
+    read_initial,
     write_estimates,
 )
 from relpos.runs.imu import ImuRecording
@@ -32,6 +33,7 @@ __all__ = [
     "drop_page",
     "load_run",
     "read_estimates",
+    "read_initial",
     "save_run",
     "write_estimates",
 ]

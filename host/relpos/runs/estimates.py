@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import astuple
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,7 +21,7 @@ from relpos.fusion.estimator import (
     Parameter,
     Shape,
 )
-from relpos.measurements import Step
+from relpos.measurements import Prior, Step
 from relpos.runs.appending import AppendedTable, close_all
 from relpos.runs.table import (
     Column,
@@ -110,6 +111,15 @@ ESTIMATE_COLUMNS, PAIR_COLUMNS, ALTERNATIVE_COLUMNS, PARAMETER_COLUMNS = (
     tuple(column.name for column in table)
     for table in (_ESTIMATE_TABLE, _PAIR_TABLE, _ALTERNATIVE_TABLE, _PARAMETER_TABLE)
 )
+_INITIAL_TABLE = (
+    Column("node", node_id),
+    Column("x_m", number),
+    Column("y_m", number),
+    Column("heading_rad", number),
+    # Empty: not known.
+    Column("sigma_m", not_negative, optional=True),
+    Column("sigma_rad", not_negative, optional=True),
+)
 STEP_COLUMNS = ("time_s", "node", "length_m")
 
 _DECIMALS = 6
@@ -121,15 +131,18 @@ def write_estimates(
     estimates: Iterable[Estimate],
     *,
     steps: Sequence[Step] = (),
+    priors: Sequence[Prior] | None = None,
 ) -> list[Path]:
     """Write ``estimate.csv``, ``pairs.csv`` and ``parameters.csv``, the others when any.
+
+    ``priors`` are the starts that the estimator began with; without a row nobody's was known.
 
     ``parameters.csv`` holds a row where a learned value or its sigma has changed.
 
     An ``alternatives.csv`` or ``steps.csv`` of an earlier run is removed where this one has no
     rows for it. Returns the files written.
     """
-    with EstimateFiles(directory) as files:
+    with EstimateFiles(directory, priors) as files:
         for estimate in estimates:
             files.write(estimate)
         files.write_steps(steps)
@@ -142,7 +155,7 @@ class EstimateFiles:
     Rows that a full disk refuses wait: see :mod:`relpos.runs.appending`.
     """
 
-    def __init__(self, directory: Path | str) -> None:
+    def __init__(self, directory: Path | str, priors: Sequence[Prior] | None = None) -> None:
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         self._estimates = AppendedTable(directory / "estimate.csv", ESTIMATE_COLUMNS)
@@ -152,6 +165,12 @@ class EstimateFiles:
             directory / "alternatives.csv", ALTERNATIVE_COLUMNS, wanted=False
         )
         self._steps = AppendedTable(directory / "steps.csv", STEP_COLUMNS, wanted=False)
+        names = [column.name for column in _INITIAL_TABLE]
+        self._initial = AppendedTable(directory / "initial.csv", names, wanted=priors is not None)
+        self._initial.add(
+            [None if value == math.inf else value for value in astuple(prior)]
+            for prior in priors or ()
+        )
         self._last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
 
     def __enter__(self) -> EstimateFiles:
@@ -184,6 +203,7 @@ class EstimateFiles:
             self._alternatives,
             self._parameters,
             self._steps,
+            self._initial,
         )
 
     @property
@@ -236,6 +256,20 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
         )
         for time_s in sorted({*nodes, *pairs, *alternatives, *parameters})
     ]
+
+
+def read_initial(directory: Path | str) -> tuple[Prior, ...] | None:
+    """Return the starts that an estimate began with; None where its files do not say."""
+    path = find_table(Path(directory), "initial.csv")
+    if path is None:
+        return None
+    priors = []
+    for _, (node, *pose, sigma_m, sigma_rad) in numbered_rows(
+        path, read_text(path), _INITIAL_TABLE
+    ):
+        sigmas = (math.inf if sigma is None else sigma for sigma in (sigma_m, sigma_rad))
+        priors.append(Prior(node, *pose, *sigmas))
+    return tuple(priors)
 
 
 def _by_time(
