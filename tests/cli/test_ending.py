@@ -9,9 +9,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from typer.core import TyperGroup
+from typer.testing import CliRunner
 
 import relpos
 from relpos.cli import fuse, live
+from relpos.cli.main import app
 from relpos.live.session import Outcome
 
 TEAM: Any = SimpleNamespace(name="/dev/pts/9", is_now=True)
@@ -57,3 +60,22 @@ def test_closed_outputs_are_no_traceback(tmp_path: Path) -> None:
     assert (no_stdout.returncode, no_stdout.stderr) == (0, "")
     neither = subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command])
     assert neither.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("where", "raised", "said"),
+    [
+        ("parse_args", KeyboardInterrupt, "relpos: interrupted\n"),
+        ("invoke", KeyboardInterrupt, "relpos: interrupted\n"),
+        ("invoke", MemoryError, "relpos: not enough memory: a shorter run, or fewer nodes\n"),
+    ],
+)
+def test_whatever_ends_a_command_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, where: str, raised: type[BaseException], said: str
+) -> None:
+    def ended(*_: object, **__: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(TyperGroup, where, ended)
+    result = CliRunner().invoke(app, ["doctor"])
+    assert (result.exit_code, result.stderr) == (1, said)

@@ -40,6 +40,13 @@ from relpos.version import __version__
 class Commands(TyperGroup):
     """The group of commands; turns what a user can cause into one line and exit status 1."""
 
+    def make_context(self, *args: Any, **more: Any) -> Any:
+        """Read the command line; Typer would end without a word at Ctrl-C here."""
+        try:
+            return super().make_context(*args, **more)
+        except KeyboardInterrupt:
+            _fail("interrupted")
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command; never let an expected failure become a traceback."""
         if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
@@ -57,6 +64,8 @@ class Commands(TyperGroup):
             _fail("interrupted")
         except OSError as error:
             _fail(words_of(error))
+        except MemoryError:
+            _fail("not enough memory: a shorter run, or fewer nodes")
 
 
 def _fail(words: str) -> None:
