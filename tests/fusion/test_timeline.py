@@ -167,6 +167,15 @@ def test_a_report_that_stands_twice_moves_its_node_once() -> None:
     assert timeline.counters == {"motions_duplicate": 1}
 
 
+@pytest.mark.parametrize("after", [3, 5, 20])
+def test_a_report_that_comes_again_behind_later_ones_moves_its_node_once(after: int) -> None:
+    timeline = Timeline(nodes=[1])
+    reports = [Motion(float(k), 1, 1.0, 0.0, 0.0) for k in range(1, 31)]
+    reports.insert(1 + after, reports[1])
+    assert end_of(run(timeline, reports), 1) == pytest.approx((30.0, 0.0, 0.0))
+    assert timeline.counters == {"motions_duplicate": 1}
+
+
 def test_a_number_that_is_none_is_an_error() -> None:
     with pytest.raises(DataError, match="finite"):
         Timeline().push(Motion(1.0, 1, math.nan, 0.0, 0.0))
@@ -395,7 +404,8 @@ def test_a_motion_is_placed_behind_one_that_was_begun_but_never_before_it() -> N
 
 def test_a_motion_at_the_time_that_its_node_has_reached_is_late_though_another_waits() -> None:
     timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=10.0)
-    for row in (moved(2.0, 1), moved(2.0, 2), moved(5.0, 1), moved(2.0, 1)):
+    other = replace(moved(2.0, 1), dx_m=2.0)
+    for row in (moved(2.0, 1), moved(2.0, 2), moved(5.0, 1), other):
         timeline.push(row)
     assert timeline.counters == {"motions_late": 1}
 

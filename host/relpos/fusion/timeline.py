@@ -99,6 +99,9 @@ class Epoch:
 
 Step = Advance | Ranging | Sensed | Epoch
 
+REMEMBERED = 64
+"""So many reports of a node are known again when they come twice."""
+
 LATEST_BEGIN_S = 60.0
 """Times that begin later count from somewhere else than the start, as the time of day does."""
 
@@ -135,11 +138,11 @@ class _Track:
     """Reports that wait, from the node's reached time on."""
     left: tuple[Displacement, float] | None = None
     """What is left of the first one, and its share of it; None where that is all."""
-    latest: Motion | None = None
-    """The report that came last."""
+    recent: deque[Motion] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """The reports that came last."""
 
     def copy(self) -> _Track:
-        return replace(self, chords=self.chords.copy())
+        return replace(self, chords=self.chords.copy(), recent=self.recent.copy())
 
 
 def refusal(measurement: Measurement) -> str | None:
@@ -338,7 +341,9 @@ class Timeline:
         for entry in arrived[:count]:
             time_s, _, measurement = entry
             if isinstance(measurement, Motion):
-                if measurement == self._tracks[measurement.node].latest:
+                track = self._tracks[measurement.node]
+                # A frame may be repeated behind later ones, too.
+                if time_s <= track.reported_s and measurement in track.recent:
                     self.counters["motions_duplicate"] += 1
                     continue
                 self._take_motion(measurement)
@@ -359,7 +364,7 @@ class Timeline:
 
     def _take_motion(self, motion: Motion) -> None:
         track = self._tracks[motion.node]
-        track.latest = motion
+        track.recent.append(motion)
         chords = track.chords
         begin_s = chords[-1].time_s if chords else track.reached_s
         placed = True
