@@ -67,12 +67,13 @@ class Strips:
     def update(self, node: Indices, peer: Indices, measured: Floats) -> None:
         """Work in the ranges."""
         count, terms = len(node), len(self.filter.terms)
-        same, no_outliers, no_slopes = (
+        level, same, no_outliers, no_slopes = (
+            np.zeros(count),
             np.ones(count),
             np.zeros((count, 3)),
             np.zeros((count, terms)),
         )
-        self.filter.update(Ranges(node, peer, measured, same, no_outliers, no_slopes))
+        self.filter.update(Ranges(node, peer, measured, level, same, no_outliers, no_slopes))
 
     def pose(self) -> Floats:
         """Poses."""

@@ -113,13 +113,14 @@ class Strips:
         from relpos.fusion.large_teams.kernels import Ranges
 
         count, terms = ranges.node.size, len(self.filter.terms)
-        same, no_outliers, no_slopes = (
+        level, same, no_outliers, no_slopes = (
+            np.zeros(count),
             np.ones(count),
             np.zeros((count, 3)),
             np.zeros((count, terms)),
         )
         self.filter.update(
-            Ranges(ranges.node, ranges.peer, ranges.range_m, same, no_outliers, no_slopes)
+            Ranges(ranges.node, ranges.peer, ranges.range_m, level, same, no_outliers, no_slopes)
         )
 
     def positions(self) -> Floats:

@@ -55,6 +55,9 @@ def advance(state: Floats, covariance: Floats, node: Indices, moved: Floats) -> 
         covariance[:, here] = covariance[:, here] @ f.T
         own = turn_by @ np.diag([sigma_x**2, sigma_y**2]) @ turn_by.T
         own += 0.5 * (1.0 - shrunk**2) ** 2 * np.outer(step, step)
+        aside = np.array([-step[1], step[0]])
+        swept = 0.5 * (1.0 - shrunk**4) - heading_variance * shrunk**2
+        own += max(swept, 0.0) * np.outer(aside, aside)
         covariance[at : at + 2, at : at + 2] += own
         state[i, :2] += shrunk * step
         state[i, 2] += turn - duration_s * state[i, 3]
@@ -83,17 +86,22 @@ def update(
     peer: Indices,
     measured: Floats,
     sigma_m: float,
+    lift_m2: Floats | float = 0.0,
 ) -> None:
-    """Work in ranges (E,) in place: the textbook's gain for all of them at once."""
-    distance, _, across, bearing = spread(state, covariance, node, peer)
-    middle = np.sqrt(distance**2 + across + NEAREST_M**2)
+    """Work in ranges (E,) in place: the textbook's gain for all of them at once.
+
+    ``lift_m2`` are the squares of the differences of height.
+    """
+    distance, along, across, bearing = spread(state, covariance, node, peer)
+    tilted = along * lift_m2 / (distance**2 + lift_m2)
+    middle = np.sqrt(distance**2 + lift_m2 + across + tilted + NEAREST_M**2)
     slope = distance / middle
     h = np.zeros((len(node), covariance.shape[0]))
     e = np.arange(len(node))
     for place, sign in ((node, -1.0), (peer, 1.0)):
         h[e, PER_NODE * place] += sign * slope * np.cos(bearing)
         h[e, PER_NODE * place + 1] += sign * slope * np.sin(bearing)
-    noise = sigma_m**2 + 0.5 * (across / middle) ** 2
+    noise = sigma_m**2 + 0.5 * (across**2 + tilted**2) / middle**2
     whitened = np.linalg.solve(h @ covariance @ h.T + np.diag(noise), np.eye(len(node)))
     gain = covariance @ h.T @ whitened
     moved = (gain @ (measured - middle)).reshape(state.shape)

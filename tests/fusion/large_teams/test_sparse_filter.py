@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -60,8 +61,8 @@ def plain(
 ) -> Ranges:
     """Ranges that are alike, and depend on no terms."""
     count = len(node)
-    no_slopes = np.zeros((count, len(made.terms)))
-    return Ranges(node, peer, measured_m, np.ones(count), np.zeros((count, 3)), no_slopes)
+    no_slopes, level = np.zeros((count, len(made.terms))), np.zeros(count)
+    return Ranges(node, peer, measured_m, level, np.ones(count), np.zeros((count, 3)), no_slopes)
 
 
 def random_moves(rng: np.random.Generator, count: int) -> Floats:
@@ -84,9 +85,10 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
             moved_s += moved[:, 6]
         dense.wander(covariance, np.arange(9), moved_s)
         true = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
-        measured = true + rng.normal(0.0, SIGMA_M, node.size)
-        made.update(plain(made, node, peer, measured))
-        dense.update(pose, covariance, node, peer, measured, SIGMA_M)
+        lift_m2 = rng.uniform(0.0, 9.0, node.size)
+        measured = np.sqrt(true**2 + lift_m2) + rng.normal(0.0, SIGMA_M, node.size)
+        made.update(plain(made, node, peer, measured)._replace(lift_m2=lift_m2))
+        dense.update(pose, covariance, node, peer, measured, SIGMA_M, lift_m2)
     assert np.abs(pose[:, 3:]).max() > 0.01
     # Ways are turned by the next motion, even if it is none.
     made.predict(np.arange(9), np.zeros((9, 7)))
@@ -122,7 +124,7 @@ def test_terms_delays_and_clocks_are_those_of_a_dense_filter_with_them_as_states
         true = np.hypot(*(state[node, :2] - state[peer, :2]).T)
         measured = true + rng.normal(0.0, SIGMA_M, node.size) + slopes[:, TERMS + 6] * 0.3
         sure, none = np.ones(node.size), np.zeros((node.size, 3))
-        made.update(Ranges(node, peer, measured, sure, none, slopes))
+        made.update(Ranges(node, peer, measured, none[:, 0], sure, none, slopes))
         dense.update_with_terms(state, terms, joint, (node, peer), measured, slopes, SIGMA_M)
     own, carried = dense.given_terms(joint, 7)
     assert np.allclose(made.state, state, atol=1e-4)
@@ -155,7 +157,7 @@ def test_a_team_that_outgrows_delays_and_clocks_keeps_what_all_ranges_have_in_co
     ones, none = np.ones(node.size), np.zeros((node.size, 3))
     common = rng.normal(0.0, 1.0, (node.size, TERMS))
     slopes = made.slopes_in_terms(node, peer, common, rng.normal(0.0, 1.0, node.size))
-    made.update(Ranges(node, peer, measured, ones, none, slopes))
+    made.update(Ranges(node, peer, measured, none[:, 0], ones, none, slopes))
     terms, sigma = made.terms[:TERMS], made.sigma_of_terms()[:TERMS]
     made.own_sd = ()
     made.add(pose[5:].copy(), variance[None])
@@ -213,6 +215,48 @@ def test_a_displacement_errs_along_its_way_more_than_across_it_and_takes_no_time
     assert moved[:, 5] == pytest.approx(np.sqrt(variances[:, 1] + variances[:, 2]), rel=1e-12)
     assert moved[:, 6].tolist() == [0.0, *moves[1:, 3]]
     assert (moved[:, :3] == moves[:, :3]).all()
+
+
+def test_the_way_under_a_vague_heading_is_as_uncertain_across_as_along_it() -> None:
+    made = NeighbourhoodFilter(math.inf)
+    heading_rad, way_m = np.array([0.1, 0.7, 1.4, 1.8]), 5.0
+    start = np.diag([0.0, 0.0, 1.0]) * heading_rad[:, None, None] ** 2
+    made.add(np.zeros((4, 3)), start)
+    made.predict(np.arange(4), np.tile([way_m, 0, 0, 0, 0, 0, 1.0], (4, 1)))
+    along_m2, across_m2, *_ = made.marginals().T
+    # The moments of cosine and sine of a normal angle.
+    kept = np.exp(-(heading_rad**2))
+    assert made.state[:, 0] == pytest.approx(way_m * np.sqrt(kept), rel=1e-6)
+    assert along_m2 == pytest.approx(0.5 * (way_m * (1.0 - kept)) ** 2, abs=1e-6)
+    assert across_m2 == pytest.approx(0.5 * way_m**2 * (1.0 - kept**2), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "sigma_m", "true_m"), [(1.5, 0.4, 1.2), (3.0, 0.4, 2.8), (1.0, 0.2, 1.2)]
+)
+def test_a_range_from_above_tells_of_the_plane_what_the_grid_of_all_places_tells(
+    apart_m: float, sigma_m: float, true_m: float
+) -> None:
+    height_m = 3.5
+    measured_m = math.hypot(true_m, height_m)
+    made = NeighbourhoodFilter(
+        math.inf, RangeModel(SIGMA_M), terms_information=1e12 * np.eye(TERMS)
+    )
+    starts = np.array([np.zeros(3), [sigma_m**2, sigma_m**2, 0.01]])
+    made.add(np.array([[0.0, 0.0, 0.0], [apart_m, 0.0, 0.0]]), starts[:, None] * np.eye(3))
+    above = plain(made, np.array([0]), np.array([1]), np.array([measured_m]))
+    made.update(above._replace(lift_m2=np.array([height_m**2])))
+    # The posterior of the upper one's place, by brute force.
+    off_m = np.linspace(-6.0 * sigma_m, 6.0 * sigma_m, 1201)
+    x, y = apart_m + off_m[:, None], off_m
+    misfit = (measured_m - np.sqrt(x**2 + y**2 + height_m**2)) / SIGMA_M
+    density = np.exp(-0.5 * (((x - apart_m) ** 2 + y**2) / sigma_m**2 + misfit**2))
+    weight = density.sum(axis=1) / density.sum()
+    mean_m = weight @ x[:, 0]
+    spread_m = math.sqrt(weight @ (x[:, 0] - mean_m) ** 2)
+    assert made.pose[1, 0] == pytest.approx(mean_m, abs=0.1 * spread_m)
+    # As a level distance the rest of the range left half of it.
+    assert math.sqrt(made.marginals()[1, 0]) == pytest.approx(spread_m, rel=0.1)
 
 
 def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> None:

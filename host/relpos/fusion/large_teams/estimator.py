@@ -117,7 +117,9 @@ class _Collected(NamedTuple):
 
     measured: Range
     excess_m: float
-    """By how much it exceeded the distance that was estimated at its instant."""
+    """By how much it exceeded the slant distance that was estimated at its instant."""
+    lift_m2: float
+    """Mean square of the difference of heights."""
     slopes: tuple[float, ...]
     variance_m2: float
     """What uncertain heights, and ways within reports, add to the range's."""
@@ -384,16 +386,16 @@ class LargeTeam:
             ranges, places_m, headings, heights, strict=True
         ):
             ends = self._known[r.node], self._known[r.peer]
-            horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
+            lift_m2 = height_m**2 + variance_m2
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
-            apart_m = math.hypot(peer_x - x, peer_y - y)
-            near_m = max(apart_m, NEAREST_M)
+            slant_m = math.sqrt((peer_x - x) ** 2 + (peer_y - y) ** 2 + lift_m2)
+            near_m = max(slant_m, NEAREST_M)
             sight = (peer_x - x) / near_m, (peer_y - y) / near_m
-            slopes = common_slopes(sight, apart_m, facing, [k.velocity_at(time_s) for k in ends])
-            within_m2 = sum(_within_m2(k, time_s) for k in ends)
-            excess_m = horizontal_m - apart_m
-            self._collected.append(_Collected(r, excess_m, slopes, lifted_m2 + within_m2))
+            slopes = common_slopes(sight, slant_m, facing, [k.velocity_at(time_s) for k in ends])
+            vague_m2 = lifted_m2 + sum(_within_m2(k, time_s) for k in ends)
+            excess_m = r.range_m - slant_m
+            self._collected.append(_Collected(r, excess_m, lift_m2, slopes, vague_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
         self._collected_s = min(self._collected_s, time_s)
         self._ranges_used += len(ranges)
@@ -407,28 +409,32 @@ class LargeTeam:
         node, peer = (np.array([self._row[n] for n in ends]) for ends in zip(*pairs, strict=True))
         common = np.array([c.slopes for c in self._collected])
         excess = np.array([c.excess_m for c in self._collected])
-        lifted = np.array([c.variance_m2 for c in self._collected])
+        lift = np.array([c.lift_m2 for c in self._collected])
+        vague = np.array([c.variance_m2 for c in self._collected])
         self._collected, self._collected_s = [], math.inf
         f = self.filter
         if not math.isfinite(f.width_m) and len(self._nodes) > ONE_STRIP:
             f.widen(self._reach_m * REACH_SLACK)
         slopes = f.slopes_in_terms(node, peer, common[:, :-1], common[:, -1])
         apart_m, spread_m2 = f.antenna_pairs(node, peer)[:2]
-        horizontal = excess + apart_m
+        slant = np.sqrt(apart_m**2 + lift)
+        measured = excess + slant
         before, prior = f.pose.copy(), f.marginals()
         # A range of twice the variance counts half.
-        counts = self._correlation.repeats(pairs).sample_count / (1.0 + lifted / f.model.sigma_m**2)
+        counts = self._correlation.repeats(pairs).sample_count / (1.0 + vague / f.model.sigma_m**2)
+        spread_m2 *= (apart_m / np.maximum(slant, NEAREST_M)) ** 2
         innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2)
         outliers = self._outliers.expected(time_s, pairs)
-        inlier = f.update(Ranges(node, peer, horizontal, counts, outliers, slopes))
+        inlier = f.update(Ranges(node, peer, measured, lift, counts, outliers, slopes))
         self._correct_unseen(pairs, time_s, before[:, :2], prior)
-        horizontal -= slopes @ f.terms
-        self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])
+        measured -= slopes @ f.terms
+        slant = np.sqrt(f.antenna_pairs(node, peer)[0] ** 2 + lift)
+        self._outliers.learn(time_s, pairs, inlier, measured - slant)
         self._correlation.learn(pairs, innovation, inlier)
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
-        self._learn_sigma(node, peer, horizontal, inlier)
+        self._learn_sigma(f.antenna_pairs(node, peer), measured, lift, inlier)
         news = 1.0 - outliers[:, 0]
         self._inflate(time_s, both, np.tile(inlier, 2), np.tile(news, 2))
 
@@ -447,13 +453,14 @@ class LargeTeam:
                 covariances = (of[row][[0, 2, 2, 1]].reshape(2, 2) for of in (prior, posterior))
                 known.unseen.correct(moved_m, *covariances)
 
-    def _learn_sigma(self, node: Indices, peer: Indices, measured: Floats, inlier: Floats) -> None:
+    def _learn_sigma(self, pairs: Floats, measured: Floats, lift: Floats, inlier: Floats) -> None:
         """Learn the range sigma by online expectation maximisation.
 
         E |z - d|^2 after the ranges is the residual's square plus what is still uncertain of d.
         """
-        pairs, model = self.filter.antenna_pairs(node, peer), self.filter.model
-        square = (measured - np.sqrt(pairs[0] ** 2 + pairs[2])) ** 2 + pairs[1]
+        model, square_m2 = self.filter.model, pairs[0] ** 2 + pairs[2] + lift
+        square = (measured - np.sqrt(square_m2)) ** 2
+        square += pairs[1] * (1.0 - lift / np.maximum(square_m2, NEAREST_M**2))
         total = float(inlier.sum())
         summed = model.sigma_m**2 * self._sigma_count + float((inlier * square).sum())
         sigma_m = max(math.sqrt(summed / (self._sigma_count + total)), 0.01)

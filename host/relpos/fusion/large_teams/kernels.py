@@ -63,7 +63,8 @@ def move(
     xy, the heading's variance, its covariance with the drift, and the drift's variance.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
-    exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, the second-order terms.
+    exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, across by d^2 (1 - exp(-2v)) / 2,
+    of which the derivative has d^2 v exp(-v): statistical linearisation, as in the bank.
     """
     for e in range(len(node)):
         i = node[e]
@@ -81,17 +82,19 @@ def move(
         spread += noise[i, 5]
         shrunk = math.exp(-0.5 * spread)
         dx, dy = c * forward - s * left, s * forward + c * left
-        along = 0.5 * (1.0 - shrunk * shrunk) ** 2
+        short2 = shrunk * shrunk
+        along = 0.5 * (1.0 - short2) ** 2
+        swept = max(0.5 - 0.5 * short2 * short2 - spread * short2, 0.0)
         # Derivative of the displacement by the heading.
         hx, hy = -shrunk * dy, shrunk * dx
         xh, yh, hh = noise[i, 3], noise[i, 4], noise[i, 5]
         sx, sy = moved[e, 3] * moved[e, 3], moved[e, 4] * moved[e, 4]
         noise[i, 0] += 2.0 * hx * xh + hx * hx * hh
-        noise[i, 0] += c * c * sx + s * s * sy + along * dx * dx
+        noise[i, 0] += c * c * sx + s * s * sy + along * dx * dx + swept * dy * dy
         noise[i, 1] += hx * yh + hy * xh + hx * hy * hh
-        noise[i, 1] += c * s * (sx - sy) + along * dx * dy
+        noise[i, 1] += c * s * (sx - sy) + (along - swept) * dx * dy
         noise[i, 2] += 2.0 * hy * yh + hy * hy * hh
-        noise[i, 2] += s * s * sx + c * c * sy + along * dy * dy
+        noise[i, 2] += s * s * sx + c * c * sy + along * dy * dy + swept * dx * dx
         noise[i, 3] += hx * hh
         noise[i, 4] += hy * hh
         noise[i, 6] += SCALE_WALK * moved[e, 6]
@@ -190,6 +193,8 @@ class Ranges(NamedTuple):
     """Row of the node at one end."""
     peer: Indices
     measured_m: Floats
+    lift_m2: Floats
+    """Mean squares of the differences of height."""
     counts: Floats
     """How many independent ranges each is worth."""
     outliers: Floats
@@ -221,8 +226,9 @@ def range_information(
     slopes ux, uy, innovation, and the innovation's derivatives by the T terms. The right-hand sides
     are those of the innovations and of these derivatives.
 
-    Second order, finite where two nodes meet: with c the variance across, m^2 = d^2 + c, the
-    range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
+    Second order, finite where two nodes meet: with a and c the variances along and across, l the
+    mean square of the heights' difference and t = l / (d^2 + l), m^2 = d^2 + l + c + t a, the
+    range's variance is a d^2 / m^2 + (c^2 + t^2 a^2) / 2m^2 and its slope d / m.
     """
     blocks, sizes, strip, slot = layout.information, layout.sizes, layout.strip, layout.slot
     terms = carried.shape[2]
@@ -232,11 +238,13 @@ def range_information(
     for e in range(len(ranges.node)):
         i, j = ranges.node[e], ranges.peer[e]
         distance, along, across, bearing = pairs[0, e], pairs[1, e], pairs[2, e], pairs[3, e]
-        square = distance * distance + across + NEAREST_M * NEAREST_M
+        flat, lift = distance * distance, ranges.lift_m2[e]
+        tilted = along * lift / (flat + lift + NEAREST_M * NEAREST_M)
+        square = flat + across + (lift + tilted) + NEAREST_M * NEAREST_M
         middle = math.sqrt(square)
         innovation = ranges.measured_m[e] - middle
         outliers, again = max(model.outliers, ranges.outliers[e, 0]), ranges.outliers[e, 1]
-        curved = 0.5 * across * across / square
+        curved = 0.5 * (across * across + tilted * tilted) / square
         noise = model.sigma_m * model.sigma_m + curved
         slope = distance / middle
         expected = slope * slope * along + noise
