@@ -7,8 +7,9 @@ ever ambiguous. So :class:`SwitchingEstimator` replaces the
 else when so many have been received. The last estimates are then the priors; nodes that are not
 located yet join later.
 
-If too few of a large team are located, a *nucleus* comes first: the best connected node and some of
-its neighbours, whose initial poses a bank finds. Once most of them are found, all others join them.
+If too few of a large team are located, a *nucleus* comes first: the known nodes, else the best
+connected one, and some of their neighbours, whose initial poses a bank finds. Once most of them are
+found, all others join them.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ NUCLEUS_FOUND, NUCLEUS_EPOCHS = 4, 3
 """So many of them have to be located for so many epochs."""
 
 LISTEN_S = 4.0
-"""So long ranges are listened to before the nucleus is chosen."""
+"""So long ranges, of a known node if there is one, are listened to before the nucleus is chosen."""
 
 
 class SwitchingEstimator:
@@ -64,17 +65,17 @@ class SwitchingEstimator:
         self._recent: deque[Measurement] = deque()
         self._newest_s = -math.inf
         self._last: Estimate | None = None
+        self._told_s = -math.inf
         self._before: Counter[str] = Counter()
         self._nucleus: frozenset[int] = frozenset()
         self._first_range_s = math.inf
         self._found_epochs = 0
         self.estimator = self._large_team(priors) if self._is_large() else self._bank(priors)
 
-    def _bank(self, priors: Sequence[Prior]) -> Rewinder:
+    def _bank(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed)
-        return self._around(
-            Bank(priors, initialiser, self._settings, self._seed, self._mountings), priors
-        )
+        core = Bank(priors, initialiser, self._settings, self._seed, self._mountings)
+        return self._around(core, priors, start_s)
 
     def _large_team(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
@@ -106,12 +107,14 @@ class SwitchingEstimator:
         recent.append(measurement)
         if time_s > self._newest_s:
             self._newest_s = time_s
-            while recent[0].time_s < time_s - KEPT_S:
+            # Until a large team begins, how its known nodes have moved since the start is needed.
+            begun = self._last is not None or self._nucleus or len(self._met) <= LARGE_TEAM
+            while begun and recent[0].time_s < time_s - KEPT_S:
                 recent.popleft()
         self._met.add(measurement.node)
         if isinstance(measurement, Range):
             self._met.add(measurement.peer)
-            if time_s < self._first_range_s:
+            if time_s < self._first_range_s and self._is_of_known(measurement):
                 self._first_range_s = time_s
         if len(self._met) <= LARGE_TEAM:
             return self._feed(measurement)
@@ -123,7 +126,13 @@ class SwitchingEstimator:
         estimates = self.estimator.process(measurement)
         if estimates:
             self._last = estimates[-1]
+            self._told_s = self._last.time_s
         return estimates
+
+    def _is_of_known(self, measured: Range) -> bool:
+        """Whether one of the two has a known start, or nobody has."""
+        known = {p.node for p in self._priors if p.is_known}
+        return not known or measured.node in known or measured.peer in known
 
     def _located(self) -> int:
         """Return how many nodes a large team could begin from."""
@@ -136,11 +145,16 @@ class SwitchingEstimator:
         if not self._nucleus:
             if self._newest_s < self._first_range_s + LISTEN_S:
                 return []
-            self._nucleus = _best_connected(self._recent)
+            if not any(p.is_known for p in self._priors):
+                self._last = None
+            priors, since_s = self._starts()
+            known = {p.node for p in priors if p.is_known}
+            self._nucleus = _best_connected(self._recent, known)
             self._last = None
-            priors = [p for p in self._priors if p.node in self._nucleus]
-            self.estimator = self._bank(priors)
-            some = [m for m in self._recent if self._concerns(m)]
+            self.estimator = self._bank(
+                [p for p in priors if p.node in self._nucleus], max(since_s, 0.0)
+            )
+            some = [m for m in self._since(since_s) if self._concerns(m)]
         else:
             some = [measurement] if self._concerns(measurement) else []
         estimates = []
@@ -148,7 +162,9 @@ class SwitchingEstimator:
             for estimate in self.estimator.process(one):
                 found = sum(n.status is NodeStatus.OK for n in estimate.nodes)
                 self._found_epochs = self._found_epochs + 1 if found >= NUCLEUS_FOUND else 0
-                estimates.append(self._with_others(estimate))
+                if estimate.time_s > self._told_s:
+                    self._told_s = estimate.time_s
+                    estimates.append(self._with_others(estimate))
                 if self._found_epochs >= NUCLEUS_EPOCHS:
                     self._last = estimate
                     return estimates + self._hand_over()
@@ -173,22 +189,33 @@ class SwitchingEstimator:
 
     def _hand_over(self) -> list[Estimate]:
         """Go on as a large team from the last estimate; what came since is taken again."""
-        last = self._last
-        since_s = -math.inf if last is None else last.time_s
-        priors = list(self._priors)
-        if last is not None:
+        priors, since_s = self._starts()
+        if self._last is not None:
             self._before = Counter(self.estimator.counters())
             self._before["teams_handed_over"] += 1
-            priors = [
-                Prior(
-                    n.node, n.x_m, n.y_m, n.heading_rad,
-                    math.sqrt(0.5 * (n.variance_x_m2 + n.variance_y_m2)), n.sigma_heading_rad,
-                )
-                for n in last.nodes
-                if n.status not in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS)
-            ]  # fmt: skip
-        self.estimator = self._large_team(priors, 0.0 if last is None else since_s)
-        estimates: list[Estimate] = []
+        again = self._since(since_s)
+        self.estimator = self._large_team(priors, 0.0 if since_s == -math.inf else since_s)
+        estimates = [e for measurement in again for e in self.estimator.process(measurement)]
+        self._recent.clear()
+        return [e for e in estimates if e.time_s > max(since_s, self._told_s)]
+
+    def _starts(self) -> tuple[list[Prior], float]:
+        """Return what is known of poses, and when: by the last estimate, else at the start."""
+        if self._last is None:
+            return list(self._priors), -math.inf
+        priors = [
+            Prior(
+                n.node, n.x_m, n.y_m, n.heading_rad,
+                math.sqrt(0.5 * (n.variance_x_m2 + n.variance_y_m2)), n.sigma_heading_rad,
+            )
+            for n in self._last.nodes
+            if n.status not in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS)
+        ]  # fmt: skip
+        return priors, self._last.time_s
+
+    def _since(self, since_s: float) -> list[Measurement]:
+        """Return what was measured since then, of motions the rest."""
+        later: list[Measurement] = []
         begun: dict[int, float] = {}
         for measurement in sorted(self._recent, key=lambda m: m.time_s):
             again = measurement
@@ -198,25 +225,28 @@ class SwitchingEstimator:
                 if begin_s < since_s < measurement.time_s and math.isfinite(begin_s):
                     again = _rest(measurement, begin_s, since_s)
             if again.time_s > since_s:
-                estimates += self.estimator.process(again)
-        self._recent.clear()
-        return [e for e in estimates if e.time_s > since_s]
+                later.append(again)
+        return later
 
 
-def _best_connected(measurements: Iterable[Measurement]) -> frozenset[int]:
-    """Return the node with most ranges, then one by one that with most to those chosen."""
+def _best_connected(measurements: Iterable[Measurement], known: set[int]) -> frozenset[int]:
+    """Return the known nodes that range, then one by one that with most ranges to those chosen.
+
+    Where none has any, that with most ranges of all.
+    """
     count: Counter[tuple[int, int]] = Counter()
     degree: Counter[int] = Counter()
     for m in measurements:
         if isinstance(m, Range) and m.range_m > 0.0:
             count[min(m.node, m.peer), max(m.node, m.peer)] += 1
             degree.update((m.node, m.peer))
-    chosen = {min(degree, key=lambda node: (-degree[node], node))}
+    chosen = known & degree.keys()
     while len(chosen) < NUCLEUS:
         near: Counter[int] = Counter()
         for (a, b), times in count.items():
             if (a in chosen) != (b in chosen):
                 near[b if a in chosen else a] += 10 + times
+        near = near or Counter({node: degree[node] for node in degree.keys() - chosen})
         if not near:
             break
         chosen.add(min(near, key=lambda node: (-near[node], node)))

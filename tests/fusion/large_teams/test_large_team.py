@@ -190,6 +190,39 @@ def test_a_team_that_becomes_large_continues_from_its_last_poses(
             assert math.hypot(n.x_m - truth[n.node - 1, 0], n.y_m - truth[n.node - 1, 1]) < 1.5
 
 
+@pytest.mark.parametrize("first_range_s", [0.0, 30.0])
+def test_the_few_known_starts_of_a_large_team_define_its_frame(first_range_s: float) -> None:
+    """In the frame of those who have most ranges: 23 and 30 m."""
+    run = simulate_mission("mission-base", 5, {"nodes": LARGE_TEAM + 2, "seconds": 55})
+    known = run.priors[:3]
+    unknown = [Prior(p.node, 0.0, 0.0, 0.0, math.inf, math.inf) for p in run.priors[3:]]
+    measurements = [
+        m for m in run.measurements if not isinstance(m, Range) or m.time_s > first_range_s
+    ]
+    last = estimates_of([*known, *unknown], measurements)[0][-1]
+    truth = tracks.true_tracks(run.truth)
+    for n in last.nodes:
+        if n.status is NodeStatus.OK:
+            there = truth[n.node]
+            off_x = n.x_m - np.interp(last.time_s, there.time_s, there.x_m)
+            off_y = n.y_m - np.interp(last.time_s, there.time_s, there.y_m)
+            assert math.hypot(off_x, off_y) < 3.0
+    assert sum(n.status is NodeStatus.OK for n in last.nodes) > 15
+
+
+def test_time_goes_on_when_a_team_of_which_nobody_is_known_becomes_large() -> None:
+    run = simulate_mission("mission-base", 5, {"nodes": LARGE_TEAM + 2, "seconds": 30})
+    few = {p.node for p in run.priors[:8]}
+    measurements = [
+        m
+        for m in run.measurements
+        if m.time_s > 8.0 or (m.node in few and (not isinstance(m, Range) or m.peer in few))
+    ]
+    times = [e.time_s for e in estimates_of([], measurements)[0]]
+    assert len(times) > 20
+    assert times == sorted(set(times))
+
+
 def test_the_same_measurements_give_the_same_estimates(crowd: Crowd) -> None:
     measurements = [m for m in crowd.measurements() if m.time_s <= 12.0]
     one, _ = estimates_of(crowd.priors(), measurements)
