@@ -19,6 +19,9 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from relpos.fusion.arrays import Floats
 from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.estimator import Estimate, NodeStatus, unlocated
 from relpos.fusion.estimator_settings import BankSettings
@@ -26,6 +29,7 @@ from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Core, Rewinder
+from relpos.fusion.rigid_motion import rigid_motion
 from relpos.fusion.timeline import Displacement, Timeline, refusal
 from relpos.measurements import Measurement, Motion, Prior, Range
 
@@ -77,9 +81,13 @@ class SwitchingEstimator:
         core = Bank(priors, initialiser, self._settings, self._seed, self._mountings)
         return self._around(core, priors, start_s)
 
-    def _large_team(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
+    def _large_team(
+        self, priors: Sequence[Prior], start_s: float = 0.0, common: Floats | None = None
+    ) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
         core = LargeTeam(priors, initialiser, self._settings, self._mountings)
+        if common is not None:
+            core.filter.common += common
         return self._around(core, priors, start_s)
 
     def _around(self, core: Core, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
@@ -190,11 +198,16 @@ class SwitchingEstimator:
     def _hand_over(self) -> list[Estimate]:
         """Go on as a large team from the last estimate; what came since is taken again."""
         priors, since_s = self._starts()
+        common = None
         if self._last is not None:
             self._before = Counter(self.estimator.counters())
             self._before["teams_handed_over"] += 1
+            if isinstance(self.estimator.core, Bank):
+                common = self.estimator.core.core.hypotheses.common_motion()
+                priors = [_alone(p, common) for p in priors]
         again = self._since(since_s)
-        self.estimator = self._large_team(priors, 0.0 if since_s == -math.inf else since_s)
+        start_s = 0.0 if since_s == -math.inf else since_s
+        self.estimator = self._large_team(priors, start_s, common)
         estimates = [e for measurement in again for e in self.estimator.process(measurement)]
         self._recent.clear()
         return [e for e in estimates if e.time_s > max(since_s, self._told_s)]
@@ -251,6 +264,22 @@ def _best_connected(measurements: Iterable[Measurement], known: set[int]) -> fro
             break
         chosen.add(min(near, key=lambda node: (-near[node], node)))
     return frozenset(chosen)
+
+
+def _alone(prior: Prior, common: Floats) -> Prior:
+    """Return a start without the uncertainty of the team's rigid motion (3, 3).
+
+    As a part of each start it would be taken for independent errors, whose mean is far surer.
+    """
+    g = rigid_motion(np.array([prior.x_m]), np.array([prior.y_m]))
+    shared = (g @ common @ g.T).diagonal()
+    place_m2 = prior.sigma_m**2 - 0.5 * (shared[0] + shared[1])
+    heading_rad2 = prior.sigma_rad**2 - shared[2]
+    return replace(
+        prior,
+        sigma_m=math.sqrt(max(place_m2, 0.0)),
+        sigma_rad=math.sqrt(max(heading_rad2, 0.0)),
+    )
 
 
 def _rest(motion: Motion, begin_s: float, since_s: float) -> Motion:

@@ -14,6 +14,8 @@ from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus, switching
+from relpos.fusion.bank.estimator import Bank
+from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.fusion.switching import LARGE_TEAM
@@ -188,6 +190,48 @@ def test_a_team_that_becomes_large_continues_from_its_last_poses(
     for n in estimates[-1].nodes:
         if n.node <= few:
             assert math.hypot(n.x_m - truth[n.node - 1, 0], n.y_m - truth[n.node - 1, 1]) < 1.5
+
+
+def shared(pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Variances of shift (m^2) and turn (rad^2) about its middle of a team, poses (N, 3)."""
+    g = np.tile(np.eye(3), (len(pose), 1))
+    x_m, y_m = (pose[:, :2] - pose[:, :2].mean(axis=0)).T
+    g[0::3, 2], g[1::3, 2] = -y_m, x_m
+    told = covariance + 1e-9 * np.eye(len(covariance))
+    return np.linalg.inv(g.T @ np.linalg.solve(told, g)).diagonal()
+
+
+def test_a_team_that_becomes_large_knows_no_better_where_its_frame_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As independent errors of each it had a fifth of the variance; places had a NEES of 2.4."""
+    monkeypatch.setattr(switching, "LARGE_TEAM", 8)
+    run = simulate_mission("mission-base", 3, {"nodes": 9, "seconds": 42})
+    few = {p.node for p in run.priors[:8]}
+    made = fusion.make("bank", run.priors[:8], {"hypotheses": 20}, 0)
+    assert isinstance(made, switching.SwitchingEstimator)
+    before = np.zeros(3)
+    for m in run.measurements:
+        if m.time_s > 40.0:
+            core = made.estimator.core
+            if isinstance(core, LargeTeam):
+                break
+            assert isinstance(core, Bank)
+            mean, covariance, common = core.core.moments()
+            poses = (PER_NODE * np.arange(8)[:, None] + np.arange(3)).ravel()
+            before = shared(mean[poses].reshape(8, 3), (covariance + common)[np.ix_(poses, poses)])
+        if m.time_s > 40.0 or (m.node in few and (not isinstance(m, Range) or m.peer in few)):
+            made.process(m)
+    assert isinstance(core, LargeTeam)
+    large = core.filter
+    states = (5 * np.arange(8)[:, None] + np.arange(3)).ravel()
+    x_m, y_m = large.pose[:8, :2].T
+    g = np.tile(np.eye(3), (8, 1))
+    g[0::3, 2], g[1::3, 2] = -y_m, x_m
+    own = large._dense()[np.ix_(states, states)]
+    after = shared(large.pose[:8], own + g @ large.common @ g.T)
+    assert (after > 0.9 * before).all()
+    assert (after < 2.0 * before).all()
 
 
 @pytest.mark.parametrize("first_range_s", [0.0, 30.0])

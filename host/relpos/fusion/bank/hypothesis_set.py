@@ -86,6 +86,16 @@ class HypothesisSet(HypothesisArrays):
         covariance[np.ix_(entries, entries)] -= g @ known @ g.T
         return mean, covariance
 
+    def common_motion(self) -> Floats:
+        """Return the covariance (3, 3) of the team's rigid motion about the origin, all of it."""
+        mean, covariance = self.moments(poses_alone=True)
+        if self.nodes < 2:
+            return self.common
+        _, known = common_rotation.estimate(mean, covariance, self.nodes)
+        entries = storage.order(self.nodes, len(mean))[: storage.POSE * self.nodes]
+        middle = mean[entries].reshape(-1, storage.POSE).mean(axis=0)[:2]
+        return self.common + about_origin(known, *middle)
+
     def put_back_common_rotation(self) -> None:
         """Put back what was taken out: an absolute heading is to measure it."""
         if self.common[2, 2] > 0.0:
