@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -37,3 +40,22 @@ def words_of(error: Exception) -> str:
         return error.args[0] if error.args and isinstance(error.args[0], str) else str(error)
     where = f"{error.filename}: " if error.filename else ""
     return f"{where}{error.strerror or error}"
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Let processes that are started within leave Ctrl-C, which reaches all of a terminal, to this.
+
+    Whoever ignores it only in its own first line prints a traceback while it still imports.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # the first process starts it, and then unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

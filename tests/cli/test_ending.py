@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +17,11 @@ from typer.core import TyperGroup
 from typer.testing import CliRunner
 
 import relpos
+from relpos import fusion
 from relpos.cli import fuse, live
 from relpos.cli.main import app
+from relpos.errors import interrupts_kept
+from relpos.fusion import kernel_cache
 from relpos.live.session import Outcome
 
 TEAM: Any = SimpleNamespace(name="/dev/pts/9", is_now=True)
@@ -79,3 +86,43 @@ def test_whatever_ends_a_command_is_one_line(
     monkeypatch.setattr(TyperGroup, where, ended)
     result = CliRunner().invoke(app, ["doctor"])
     assert (result.exit_code, result.stderr) == (1, said)
+
+
+def test_ctrl_c_is_no_traceback_of_a_process_that_still_starts() -> None:
+    with interrupts_kept():
+        process = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,))
+        process.start()
+    assert process.pid is not None
+    time.sleep(0.1)  # It imports: what ignores Ctrl-C in its first line does not yet.
+    os.kill(process.pid, signal.SIGINT)
+    process.join(3.0)
+    assert process.is_alive()
+    process.kill()
+    process.join()
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+
+
+def test_ctrl_c_ends_the_processes_that_compile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler, ledger = tmp_path / "python", tmp_path / "started"
+    ledger.touch()
+    compiler.write_text(f"#!/bin/sh\necho $$ >> {ledger}\nexec sleep 60\n")
+    compiler.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(compiler))
+    monkeypatch.setattr(kernel_cache, "is_complete", lambda rooms: False)
+
+    def interrupted(*_: object) -> None:
+        while len(started := ledger.read_text().split()) < len(rooms):
+            time.sleep(0.01)
+        pids.extend(map(int, started))
+        raise KeyboardInterrupt
+
+    pids: list[int] = []
+    rooms = fusion.ROOMS["particle"]
+    with pytest.raises(KeyboardInterrupt):
+        fusion.warm_up("particle", interrupted)
+    assert pids
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)

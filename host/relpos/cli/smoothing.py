@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relpos.errors import interrupts_kept
 from relpos.live.tracks import Tracks
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ class Smoothing:
         self._process = context.Process(
             target=_smooth, args=(self._paths, theirs), name="relpos smoother", daemon=True
         )
-        self._process.start()
+        with interrupts_kept():
+            self._process.start()
         theirs.close()
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ import multiprocessing
 import signal
 from typing import TYPE_CHECKING, Any
 
-from relpos.errors import DeviceError, RelposError
+from relpos.errors import DeviceError, RelposError, interrupts_kept
 from relpos.measurements import Prior
 
 from .pty import require_pseudo_terminals
@@ -36,7 +36,8 @@ class EmulatorProcess:
         self._process = context.Process(
             target=_serve, args=(config, speed, theirs), name="relpos emulator", daemon=True
         )
-        self._process.start()
+        with interrupts_kept():
+            self._process.start()
         theirs.close()
         try:
             answer: Any = ours.recv()

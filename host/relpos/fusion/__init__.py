@@ -18,7 +18,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from relpos.errors import RelposError
+from relpos.errors import RelposError, interrupts_kept
 from relpos.fusion import kernel_cache, plugins
 from relpos.fusion.deadreckoning import DeadReckoning
 from relpos.fusion.estimator import (
@@ -160,17 +160,21 @@ def warm_up(name: str, progress: Progress | None = None) -> None:
     rooms = [room for room in ROOMS.get(name, ()) if not kernel_cache.is_complete([room])]
     for room in rooms:  # a temporary folder, where it has to be one, is shared with the processes
         kernel_cache.folder_here(kernel_cache.FUSION / room)
-    compilers = {
-        room: subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import rehearse; rehearse({room!r})"]
-        )
-        for room in rooms
-    }
-    for done, (room, process) in enumerate(compilers.items()):
-        if progress is not None:
-            progress("compiling", done, len(rooms))
-        if process.wait() == 0:
-            kernel_cache.mark_complete(room)
+    compilers: dict[str, subprocess.Popen[bytes]] = {}
+    try:
+        for room in rooms:
+            words = f"from {__name__} import rehearse; rehearse({room!r})"
+            with interrupts_kept():
+                compilers[room] = subprocess.Popen([sys.executable, "-c", words])
+        for done, (room, process) in enumerate(compilers.items()):
+            if progress is not None:
+                progress("compiling", done, len(rooms))
+            if process.wait() == 0:
+                kernel_cache.mark_complete(room)
+    finally:
+        for process in compilers.values():
+            process.kill()
+            process.wait()
     for room in ROOMS.get(name, ()):
         if room not in SELDOM:
             rehearse(room, _FEW_S)

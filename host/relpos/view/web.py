@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from relpos.errors import interrupts_kept
 from relpos.fusion.estimator import NodeStatus
 from relpos.live.board import Board
 from relpos.live.requests import Request
@@ -171,7 +172,8 @@ class WebView(Sink):
             name="relpos view",
             daemon=True,
         )
-        self._process.start()
+        with interrupts_kept():
+            self._process.start()
         theirs.close()
         self._channel = ours
         self._in = b""
