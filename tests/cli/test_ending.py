@@ -126,3 +126,15 @@ def test_ctrl_c_ends_the_processes_that_compile(
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+@pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)])
+def test_an_empty_argument_is_not_the_folder_where_one_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, empty: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = ["simulate", "--scenario", "paper", "--seed", "1", *empty]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2
+    assert "empty" in result.stderr
+    assert not list(tmp_path.iterdir())

@@ -8,6 +8,7 @@ line on stderr), 2 wrong usage.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from io import TextIOWrapper
 from typing import Any
@@ -40,10 +41,13 @@ from relpos.version import __version__
 class Commands(TyperGroup):
     """The group of commands; turns what a user can cause into one line and exit status 1."""
 
-    def make_context(self, *args: Any, **more: Any) -> Any:
+    def make_context(self, info_name: Any, args: list[str], **more: Any) -> Any:
         """Read the command line; Typer would end without a word at Ctrl-C here."""
         try:
-            return super().make_context(*args, **more)
+            # As of --out "$DIR" without a DIR: it would be the folder where one happens to be.
+            if any(not word or re.fullmatch("--[a-z-]+=", word) for word in args):
+                raise typer.BadParameter("an argument is empty: a variable without a value?")
+            return super().make_context(info_name, args, **more)
         except KeyboardInterrupt:
             _fail("interrupted")
 
