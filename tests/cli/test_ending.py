@@ -138,3 +138,13 @@ def test_an_empty_argument_is_not_the_folder_where_one_is(
     assert result.exit_code == 2
     assert "empty" in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_link_to_itself_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    relpos.save(relpos.simulate("paper", 1, seconds=5), tmp_path / "run")
+    command = ["convert", str(tmp_path / "run"), "--to", "run", "--out", str(tmp_path / "loop")]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 1
+    assert len(result.stderr.splitlines()) == 1
+    assert "loop" in result.stderr

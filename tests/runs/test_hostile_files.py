@@ -11,7 +11,7 @@ import zlib
 import pytest
 
 from relpos.errors import DataError
-from relpos.runs import read_estimates
+from relpos.runs import load_run, read_estimates
 
 MOTION = "time_s,node,dx_m,dy_m,dtheta_rad\n"
 RANGES = "time_s,node,peer,range_m\n"
@@ -203,3 +203,11 @@ def test_an_estimate_of_absurd_figures_is_one_line(tmp_path, column):
     (tmp_path / "estimate.csv").write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
     with pytest.raises(DataError, match=f"line 2: column {column}: '1e300' is "):
         read_estimates(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["run.toml", "height.csv", "truth.csv.gz"])
+def test_a_link_to_where_nothing_is_is_no_missing_table(tmp_path, name):
+    (tmp_path / "motion.csv").write_text(MOTION + "1,1,0.7,0,0\n")
+    (tmp_path / name).symlink_to(tmp_path / "taken out" / name)
+    with pytest.raises(DataError, match=f"{name}: cannot be read"):
+        load_run(tmp_path)

@@ -68,6 +68,10 @@ class Commands(TyperGroup):
             _fail("interrupted")
         except OSError as error:
             _fail(words_of(error))
+        except RuntimeError as error:  # of pathlib, before Python 3.13
+            if not str(error).startswith("Symlink loop"):
+                raise
+            _fail(str(error))
         except MemoryError:
             _fail("not enough memory: a shorter run, or fewer nodes")
 

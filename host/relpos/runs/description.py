@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -100,7 +101,7 @@ _PLAIN_NUMBERS = (
 
 def read_description(path: Path) -> Description:
     """Read ``run.toml``; a missing file says nothing. DataError names file and key or line."""
-    if not path.exists():
+    if not os.path.lexists(path):
         return Description()
     return parse_description(path, read_text(path, MOST_BYTES))
 

@@ -11,6 +11,7 @@ import gzip
 import io
 import logging
 import math
+import os
 import types
 import zlib
 from collections import Counter
@@ -142,7 +143,8 @@ def flag(text: str) -> bool:
 
 def find_table(directory: Path, name: str) -> Path | None:
     """Return the file of a table: ``NAME`` or ``NAME.gz``, or None; both at once are refused."""
-    found = [path for path in _files_of(directory, name) if path.exists()]
+    # A link to where nothing is (a disk that was taken out) is no missing table.
+    found = [path for path in _files_of(directory, name) if os.path.lexists(path)]
     if len(found) == 2:
         raise DataError(f"{directory}: both {name} and {name}.gz are there; which one counts?")
     return found[0] if found else None
