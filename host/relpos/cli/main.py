@@ -41,13 +41,13 @@ from relpos.version import __version__
 class Commands(TyperGroup):
     """The group of commands; turns what a user can cause into one line and exit status 1."""
 
-    def make_context(self, info_name: Any, args: list[str], **more: Any) -> Any:
+    def make_context(self, info_name: Any, args: list[str], parent: Any = None, **more: Any) -> Any:
         """Read the command line; Typer would end without a word at Ctrl-C here."""
         try:
             # As of --out "$DIR" without a DIR: it would be the folder where one happens to be.
             if any(not word or re.fullmatch("--[a-z-]+=", word) for word in args):
                 raise typer.BadParameter("an argument is empty: a variable without a value?")
-            return super().make_context(info_name, args, **more)
+            return super().make_context(info_name, args, parent, **more)
         except KeyboardInterrupt:
             _fail("interrupted")
 
