@@ -39,7 +39,8 @@ def deadreckon(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Write motion.csv, steps.csv, height.csv and summary.json there."
+            metavar="DIR",
+            help="Write motion, steps, height and truth as CSV files and summary.json there.",
         ),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
