@@ -7,7 +7,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -33,7 +33,7 @@ PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")
 """Of Linux and macOS."""
 FAILURES: tuple[type[Exception], ...] = (serial.SerialException, OSError, TypeError)
 """Of a port that vanishes; pyserial raises TypeError where it is closed under a waiting read."""
-if os.name == "posix":
+with suppress(ImportError):
     import termios
 
     FAILURES += (termios.error,)  # pyserial passes it on where it discards what has come in

@@ -90,7 +90,10 @@ def run_session(
     fusion = FusionThread(
         plan.make_estimator, plan.priors, common=plan.common, restarts=plan.mission is not None
     )
-    files = FileSink(plan.out, plan.description, keep_received=source.is_now)
+    # A mission goes on from its checkpoint.
+    common = plan.common and plan.mission is None
+    priors = None if plan.common or plan.mission is not None else plan.priors
+    files = FileSink(plan.out, plan.description, priors, common=common, keep_received=source.is_now)
     sinks: list[Sink] = [files, *(make(hello) for make in make_sinks)]
     kept = plan.mission
     journal = None if kept is None else Journal(kept.folder.path / JOURNAL)

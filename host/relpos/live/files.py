@@ -9,7 +9,7 @@ from relpos.fusion.estimator import Estimate
 from relpos.live.log_files import log_row
 from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry
-from relpos.measurements import Observation, Step
+from relpos.measurements import Observation, Prior, Step, common_priors
 from relpos.runs import Description, EstimateFiles, RunFiles, drop_page
 from relpos.runs.appending import AppendedTable
 from relpos.runs.log import LOG_COLUMNS, LOG_FILE
@@ -24,11 +24,20 @@ class FileSink(Sink):
     """
 
     def __init__(
-        self, directory: Path, description: Description, *, keep_received: bool = True
+        self,
+        directory: Path,
+        description: Description,
+        priors: Sequence[Prior] | None = None,
+        *,
+        common: bool = False,
+        keep_received: bool = True,
     ) -> None:
         self._description = description
         drop_page(directory)
-        self._estimates = EstimateFiles(directory)
+        self._estimates = EstimateFiles(directory, priors)
+        self._common = common
+        self._begun: set[int] = set()
+        """Nodes that have been found to start at the common pose."""
         self._log = AppendedTable(directory / LOG_FILE, LOG_COLUMNS, wanted=False)
         self._received = RunFiles(directory / RECEIVED, description) if keep_received else None
         self._undescribed: OSError | None = None
@@ -59,6 +68,10 @@ class FileSink(Sink):
 
     def estimated(self, estimate: Estimate) -> None:
         """Write an estimate."""
+        if self._common:
+            new = [n.node for n in estimate.nodes if n.node not in self._begun]
+            self._begun.update(new)
+            self._estimates.write_initial(common_priors(new))
         self._estimates.write(estimate)
 
     def logged(self, entry: LogEntry) -> None:

@@ -167,11 +167,14 @@ class EstimateFiles:
         self._steps = AppendedTable(directory / "steps.csv", STEP_COLUMNS, wanted=False)
         names = [column.name for column in _INITIAL_TABLE]
         self._initial = AppendedTable(directory / "initial.csv", names, wanted=priors is not None)
-        self._initial.add(
-            [None if value == math.inf else value for value in astuple(prior)]
-            for prior in priors or ()
-        )
+        self.write_initial(priors or ())
         self._last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
+
+    def write_initial(self, priors: Iterable[Prior]) -> None:
+        """Write starts that the estimator begins with."""
+        self._initial.add(
+            [None if value == math.inf else value for value in astuple(prior)] for prior in priors
+        )
 
     def __enter__(self) -> EstimateFiles:
         return self

@@ -590,10 +590,14 @@ async function callMayday(node, by) {
   if (byId("mayday-words").textContent === "") setText(byId("mayday-words"), t("mayday.sending"));
   try {
     await postJson("/api/mayday", { node, on: true, by });
-    store.removeItem(MAYDAY);
     lastPress = null; // Else its line takes this one's place.
     setText(byId("last"), t("mayday.sent"));
-    setText(byId("mayday-words"), t("mayday.sent"));
+    // The board may have come first, and have told its end as well; or tells its end alone.
+    if (store.getItem(MAYDAY) !== null) {
+      setText(byId("mayday-words"), t("mayday.sent"));
+      maydayHad = true;
+    }
+    store.removeItem(MAYDAY);
   } catch (error) {
     setText(byId("mayday-words"), maydayHad ? t("mayday.sent") : t("mayday.failed", { error: error.message }));
     if (!error.again) store.removeItem(MAYDAY);
