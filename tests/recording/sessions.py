@@ -1,5 +1,7 @@
 """A small emulated session, and its playback to a sink: for the tests of recordings."""
 
+import errno
+import os
 from dataclasses import fields, is_dataclass
 from functools import cache
 from math import isclose
@@ -9,6 +11,7 @@ from relpos.fusion import make
 from relpos.link.port import Link
 from relpos.measurements import Measurement
 from relpos.recording.about import About
+from relpos.recording.output import Disk
 
 START_NS = 1_790_000_000_123_456_789
 
@@ -50,6 +53,19 @@ def play(sink, steps):
         sink.observed(arrival_s, observations)
         for estimate in estimates:
             sink.estimated(estimate)
+
+
+class PulledOut(Disk):
+    """A disk that fails once: its ``failing``-th confirmation."""
+
+    def __init__(self, failing):
+        self.failing = failing
+        self.calls = 0
+
+    def sync(self, file):
+        self.calls += 1
+        if self.calls == self.failing:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def alike(ours, theirs):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import threading
 import time
@@ -10,7 +9,7 @@ from array import array
 from dataclasses import replace
 
 import pytest
-from sessions import about, play, session
+from sessions import PulledOut, about, play, session
 
 from relpos.cli.smoothing import Smoothing
 from relpos.errors import DataError
@@ -21,7 +20,6 @@ from relpos.live.team_view import Alert
 from relpos.measurements import Motion
 from relpos.recording import open_recording, topics
 from relpos.recording.moments import Moments
-from relpos.recording.output import Disk
 from relpos.recording.player import History, Player
 from relpos.recording.recorder import Recorder
 from relpos.simulation.building import simulate_building
@@ -87,18 +85,10 @@ def test_sessions_of_a_mission_between_which_the_clock_was_set_follow_each_other
 def test_a_recording_is_played_with_its_further_parts_and_nothing_in_them_twice(
     tmp_path, monkeypatch
 ):
-    class PulledOut(Disk):
-        calls = 0
-
-        def sync(self, file):
-            self.calls += 1
-            if self.calls == 2:
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
-
     path, part = tmp_path / "walk.mcap", tmp_path / "walk.part2.mcap"
     cut = os.ftruncate
     monkeypatch.setattr(os, "ftruncate", lambda *to: part.exists() or cut(*to))
-    recorder = Recorder(path, about(), disk=PulledOut())
+    recorder = Recorder(path, about(), disk=PulledOut(2))
     second = 0
     while not part.exists():
         second += 1

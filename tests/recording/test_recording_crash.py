@@ -15,7 +15,7 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from sessions import about, alike, play, session
+from sessions import PulledOut, about, alike, play, session
 
 from relpos.recording import make_recorder, open_recording, save_recording
 from relpos.recording.container import Walk
@@ -321,15 +321,7 @@ def test_a_file_that_may_not_grow_is_followed_by_another_part(tmp_path):
 def test_what_a_part_repeats_of_the_one_before_is_once_in_the_joined_recording(
     tmp_path, monkeypatch
 ):
-    class PulledOut(Disk):
-        calls = 0
-
-        def sync(self, file):
-            self.calls += 1
-            if self.calls == 3:
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    path, disk, cut = tmp_path / "pulled.mcap", PulledOut(), os.ftruncate
+    path, disk, cut = tmp_path / "pulled.mcap", PulledOut(3), os.ftruncate
 
     def ftruncate(file, size):
         if not (tmp_path / "pulled.part2.mcap").exists():

@@ -95,9 +95,8 @@ def keep_recording(out: Path, command: str, made: str) -> None:
 
     if not holds_run(out):
         return
-    described = out / "run.toml"
-    source = read_description(described).source if described.exists() else None
-    if not (source or "").startswith(f"relpos {command} "):
+    source = read_description(out / "run.toml").source or ""
+    if not source.startswith(f"relpos {command} "):
         raise RelposError(f"{out}: holds a run that was not {made}: choose another --out")
 
 

@@ -31,7 +31,7 @@ from relpos.recording.container import (
     records_in,
     unpack,
 )
-from relpos.recording.output import part_path
+from relpos.recording.output import parts_of
 from relpos.recording.reader import UNREADABLE, opened, parsed
 from relpos.runs.description import Description
 
@@ -71,7 +71,7 @@ class Moments:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = list(paths)
-        paths = [part for path in paths for part in _parts_of(path)]
+        paths = [part for path in paths for part in parts_of(path)]
         self._files = [opened(path) for path in paths]
         self._walks = [Walk(file) for file in self._files]
         self._topics: list[dict[int, str]] = []
@@ -198,15 +198,6 @@ class Moments:
             row = _decoded(topics.decode_row, message)
             if row is not None:
                 yield message.time_s, row
-
-
-def _parts_of(path: Path) -> Iterator[Path]:
-    """Yield a recording's file, and those that may be its further parts."""
-    number, part = 1, path
-    while number == 1 or part.exists():
-        yield part
-        number += 1
-        part = part_path(path, number)
 
 
 def _decoded(decode: Any, message: Message) -> Any:

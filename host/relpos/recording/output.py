@@ -12,7 +12,7 @@ import contextlib
 import errno
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Condition, Thread
 
@@ -42,6 +42,15 @@ class Disk:
 def part_path(path: Path, part: int) -> Path:
     """Return the path of the ``part``-th part of a recording."""
     return path if part == 1 else path.with_name(f"{path.stem}.part{part}{path.suffix}")
+
+
+def parts_of(path: Path) -> Iterator[Path]:
+    """Yield a recording's file, and those that may be its further parts."""
+    number, part = 1, path
+    while number == 1 or part.exists():
+        yield part
+        number += 1
+        part = part_path(path, number)
 
 
 class _Syncer:

@@ -28,7 +28,7 @@ from relpos.recording.container import (
     records_in,
     unpack,
 )
-from relpos.recording.output import part_path
+from relpos.recording.output import parts_of
 from relpos.recording.schemas import all_topics
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, assemble
@@ -67,10 +67,7 @@ class Recording:
         """Look through the file; DataError where it is no recording or cannot be read."""
         files: list[_File] = []
         about: About | None = None
-        while True:
-            part = part_path(path, len(files) + 1)
-            if files and not part.exists():
-                break
+        for part in parts_of(path):
             found = _look_through(part)
             its = About.read(str(part), found.metadata)
             if files and (
