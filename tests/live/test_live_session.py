@@ -423,7 +423,7 @@ def test_a_mayday_of_somebody_whose_node_is_not_heard_sounds_and_is_shown_until_
             (6.0, Request(1, "mayday", 6.0, {"node": 9, "on": True, "by": "Kim"})),
             (22.0, Request(2, "mayday", 22.0, {"node": 9, "on": False})),
         )
-        session, album = make_session(source, deadreckoning, phones)
+        session, album = make_session(source, deadreckoning, phones, common=True)
         run_through(session)
     called = [view for view in album.views if 7.0 < view.time_s < 21.0]
     assert called
