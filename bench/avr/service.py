@@ -17,7 +17,7 @@ import numpy as np
 from relpos.emulator.air import EXCHANGE_US
 from relpos.emulator.ak8975 import ADDRESS as AK8975_ADDRESS
 from relpos.emulator.ak8975 import Ak8963, Ak8975
-from relpos.emulator.avr.board import BoardKind
+from relpos.emulator.avr.board import BoardSpec
 from relpos.emulator.avr.elf import Firmware
 from relpos.emulator.avr.engine import QUANTUM_US, AvrEngine
 from relpos.emulator.bus import I2cBus
@@ -60,7 +60,7 @@ class Service:
 
     def __init__(
         self,
-        kind: BoardKind,
+        kind: BoardSpec,
         firmware: Firmware,
         seconds: float,
         seed: int,

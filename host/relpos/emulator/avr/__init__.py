@@ -6,7 +6,7 @@ with the virtual clock. `bench/avr_budget.py` measures what the firmware needs o
 and time; the tests hold it to that. Begin with `engine.py`.
 """
 
-from relpos.emulator.avr.board import BOARDS, Board, BoardKind, Counters
+from relpos.emulator.avr.board import BOARDS, Board, BoardSpec, Counters
 from relpos.emulator.avr.elf import Firmware, read_firmware
 from relpos.emulator.avr.engine import AvrEngine
 from relpos.emulator.avr.library import SimulatorError
@@ -15,7 +15,7 @@ __all__ = [
     "BOARDS",
     "AvrEngine",
     "Board",
-    "BoardKind",
+    "BoardSpec",
     "Counters",
     "Firmware",
     "SimulatorError",

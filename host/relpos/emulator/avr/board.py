@@ -13,7 +13,7 @@ from relpos.emulator.avr.library import BusCallback, SimulatorError, load
 
 
 @dataclass(frozen=True)
-class BoardKind:
+class BoardSpec:
     """A board as the firmware knows it."""
 
     name: str
@@ -25,8 +25,8 @@ class BoardKind:
 
 
 BOARDS = {
-    "uno": BoardKind("uno", "atmega328p", 2048, 32768),
-    "mega": BoardKind("mega", "atmega2560", 8192, 262144),
+    "uno": BoardSpec("uno", "atmega328p", 2048, 32768),
+    "mega": BoardSpec("mega", "atmega2560", 8192, 262144),
 }
 
 
@@ -88,7 +88,7 @@ class Board:
 
     def __init__(
         self,
-        kind: BoardKind,
+        kind: BoardSpec,
         firmware: Firmware,
         bus: BusHandler | None = None,
         *,

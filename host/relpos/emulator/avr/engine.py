@@ -7,7 +7,7 @@ from collections.abc import Callable
 from relpos.emulator.avr.board import (
     BUS_HANGS,
     Board,
-    BoardKind,
+    BoardSpec,
     BusOperation,
     ResetCause,
 )
@@ -82,7 +82,7 @@ class AvrEngine:
 
     def __init__(
         self,
-        kind: BoardKind,
+        kind: BoardSpec,
         firmware: Firmware,
         bus: I2cBus,
         eeprom: bytearray,
