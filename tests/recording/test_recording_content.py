@@ -20,6 +20,7 @@ from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.protocol.messages import DEFAULT_KEY, PROTOCOL_VERSION
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
+from relpos.recording.moments import Moments
 from relpos.recording.replay import Replay
 from relpos.recording.schemas import all_topics
 from relpos.runs import Description, NodeInfo, Run, load_run, save_run
@@ -260,3 +261,33 @@ def test_of_a_session_that_went_on_what_was_decoded_counts_and_no_way_before_it(
     replay = Replay(open_recording(tmp_path / "later.mcap"), DEFAULT_KEY)
     assert replay.observations() == (motion,)
     assert "went on from one before" in replay.remarks[0]
+
+
+def test_a_session_of_more_than_a_week_is_read_up_to_there_and_says_so(tmp_path):
+    path = tmp_path / "week.mcap"
+    recorder = make_recorder(path, about())
+    week_s = 604_800.0
+    for at_s in (1.0, week_s - 1.0, week_s + 1.0, week_s + 86_400.0):
+        recorder.received(at_s, b"bytes")
+        recorder.observed(at_s, [Motion(at_s, 1, 0.5, 0.0, 0.0)])
+    # A node's clock may be a moment ahead of what arrived.
+    recorder.observed(week_s - 0.1, [Event(week_s + 0.1, 1, "landmark", "17")])
+    recorder.close()
+    recording = open_recording(path)
+    assert [m.time_s for m in recording.run.measurements] == [1.0, week_s - 1.0]
+    assert [at_s for at_s, _ in recording.inputs()] == [1.0, week_s - 1.0]
+    assert [at_s for at_s, _ in recording.observations_by_arrival()] == [1.0, week_s - 1.0]
+    (remark,) = recording.remarks
+    assert "lasted 8.0 days" in remark
+    moments = Moments([path])
+    assert moments.to_s == week_s
+    assert [row.time_s for _, row in moments.rows(0.0, 2 * week_s, Motion)] == [1.0, week_s - 1.0]
+
+
+def test_a_time_beyond_the_week_within_a_shorter_session_is_damage(tmp_path):
+    path = tmp_path / "odd.mcap"
+    recorder = make_recorder(path, about())
+    recorder.observed(1.0, [Motion(700_000.0, 1, 0.5, 0.0, 0.0)])
+    recorder.close()
+    with pytest.raises(DataError, match="not what it should be"):
+        _ = open_recording(path).run

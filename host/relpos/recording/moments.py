@@ -19,7 +19,7 @@ from mcap.records import Channel, Chunk, Metadata
 
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate
-from relpos.measurements import Event, Height, Motion, Range, Status
+from relpos.measurements import BOUNDS, Event, Height, Motion, Range, Status
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.container import (
@@ -119,7 +119,8 @@ class Moments:
         self._blocks.sort(key=lambda block: block.end_ns)
         self._ends = [block.end_ns for block in self._blocks]
         self.from_s = min(block.start_ns for block in self._blocks) * 1e-9
-        self.to_s = self._ends[-1] * 1e-9
+        # What is behind it no reader takes, as :class:`Recording` says.
+        self.to_s = min(self._ends[-1] * 1e-9, BOUNDS["time_s"][1])
 
     def again(self) -> Moments:
         """Return the same with files of their own, for another thread."""

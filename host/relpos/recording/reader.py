@@ -14,7 +14,7 @@ from mcap.records import Channel, Chunk, Metadata
 
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate
-from relpos.measurements import Observation
+from relpos.measurements import BOUNDS, Observation
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.container import (
@@ -32,6 +32,8 @@ from relpos.recording.output import parts_of
 from relpos.recording.schemas import all_topics
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, assemble
+
+_LATEST_S = BOUNDS["time_s"][1]
 
 
 @dataclass
@@ -110,12 +112,26 @@ class Recording:
             if file in self._cut_off:
                 cut = f", {file.unread} bytes of a last block are cut off" if file.unread else ""
                 remarks.append(f"{file.path}: was not closed{cut}; read up to {self._end(file)}")
+        if self._beyond_time:
+            remarks.append(
+                f"{self.path}: lasted {self._lasted_s / 86_400.0:.1f} days: what is behind "
+                f"{_LATEST_S / 86_400.0:.0f} days, which no estimator takes, is left out"
+            )
         remarks.extend(
             f"{self.path}: not recorded between {gap.from_s:.1f} and {gap.to_s:.1f} s: "
             f"{gap.inputs} reads of the port, {gap.others} estimates"
             for gap in self._rows({topics.GAP})
         )
         return tuple(remarks)
+
+    @property
+    def _lasted_s(self) -> float:
+        last_ns = max((file.last_ns or 0 for file in self.files), default=0)
+        return (last_ns - (self.about.started_unix_ns if self.about else 0)) * 1e-9
+
+    @property
+    def _beyond_time(self) -> bool:
+        return self.about is not None and self._lasted_s > _LATEST_S
 
     @property
     def _cut_off(self) -> list[_File]:
@@ -160,14 +176,11 @@ class Recording:
 
         With each the session's time at which it did, in seconds.
         """
-        for entry in self.entries({topics.SERIAL, *_PHONE}):
-            if entry.topic == topics.SERIAL:
-                serial = self._decoded(entry, lambda e: topics.decode_serial(e.data))
-                yield serial.arrival_s, serial
-            else:
-                row: Observation = self._decoded(entry, _row)
-                if topics.is_input(row):
-                    yield self._session_s(entry), row
+        for entry, entered in self._decoded({topics.SERIAL, *_PHONE}, _input):
+            if isinstance(entered, topics.Serial):
+                yield entered.arrival_s, entered
+            elif topics.is_input(entered):
+                yield self._session_s(entry), entered
 
     def observations(self) -> Iterator[Observation]:
         """Yield decoded observations, and those of phones, in the order of the session."""
@@ -175,31 +188,31 @@ class Recording:
 
     def observations_by_arrival(self) -> Iterator[tuple[float, Observation]]:
         """The same, each with the session's time at which it was there."""
-        for entry in self.entries(_OBSERVED):
-            yield self._session_s(entry), self._decoded(entry, _row)
+        for entry, row in self._decoded(_OBSERVED, _row):
+            yield self._session_s(entry), row
 
     def _session_s(self, entry: Entry) -> float:
         return (entry.log_ns - (self.about.started_unix_ns if self.about else 0)) * 1e-9
 
     def _rows(self, wanted: Collection[str]) -> Iterator[Any]:
-        for entry in self.entries(wanted):
-            yield self._decoded(entry, _row)
+        return (row for _, row in self._decoded(wanted, _row))
 
-    def _decoded(self, entry: Entry, decode: Any) -> Any:
-        try:
-            return decode(entry)
-        except UNREADABLE as error:
-            raise DataError(
-                f"{self.path}: message {entry.sequence} on {entry.topic}: not what it should be "
-                f"({error!r})"
-            ) from None
+    def _decoded(self, wanted: Collection[str], decode: Any) -> Iterator[tuple[Entry, Any]]:
+        for entry in self.entries(wanted):
+            try:
+                yield entry, decode(entry)
+            except UNREADABLE as error:
+                if isinstance(error, topics.BeyondTimeError) and self._beyond_time:
+                    continue
+                raise DataError(
+                    f"{self.path}: message {entry.sequence} on {entry.topic}: not what it should "
+                    f"be ({error!r})"
+                ) from None
 
     def estimates(self) -> Iterator[Estimate]:
         """The recorded estimates, one after the other."""
         estimate: Estimate | None = None
-        for entry in self.entries(set(topics.LISTS.values())):
-            found = self._decoded(entry, lambda e: topics.decode_list(e.topic, e.data))
-            time_s, kind, rows = found
+        for _, (time_s, kind, rows) in self._decoded(set(topics.LISTS.values()), _list):
             if kind is NodeEstimate:
                 if estimate is not None:
                     yield estimate
@@ -256,6 +269,14 @@ UNREADABLE = (
 
 def _row(entry: Entry) -> Any:
     return topics.decode_row(entry.topic, entry.data)
+
+
+def _list(entry: Entry) -> Any:
+    return topics.decode_list(entry.topic, entry.data)
+
+
+def _input(entry: Entry) -> Any:
+    return topics.decode_serial(entry.data) if entry.topic == topics.SERIAL else _row(entry)
 
 
 def opened(path: Path) -> Any:

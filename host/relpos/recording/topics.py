@@ -128,6 +128,11 @@ LIST_NAMES: Mapping[type, str] = {
 
 DIGITS = 9
 
+
+class BeyondTimeError(ValueError):
+    """A time beyond the bounds of ours, as of a session that has lasted for more than a week."""
+
+
 ELLIPSE = ("sigma_major_m", "sigma_minor_m", "sigma_angle_rad")
 """Follow from the covariance and are there for plots; not read back."""
 
@@ -222,7 +227,7 @@ def _time_s(value: Any) -> float:
     low, high = BOUNDS["time_s"]
     time_s = float(value)
     if not low <= time_s <= high:
-        raise ValueError(f"a time of {time_s:g} s")
+        raise BeyondTimeError(f"a time of {time_s:g} s")
     return time_s
 
 
@@ -237,7 +242,8 @@ def decode_row(topic: str, data: bytes) -> Any:
     row = _build(kind, json.loads(data))
     beyond = out_of_bounds(row)
     if beyond is not None:
-        raise ValueError(f"{beyond} is {getattr(row, beyond):g}")
+        error = BeyondTimeError if beyond == "time_s" else ValueError
+        raise error(f"{beyond} is {getattr(row, beyond):g}")
     return row
 
 
