@@ -196,6 +196,22 @@ def test_an_alarm_reaches_the_phones_and_addresses_its_wearer(visit, stage: Stag
     wait_for(lambda: stage.acknowledged == [2])
 
 
+@pytest.mark.parametrize("path", ["/", "/phone"])
+def test_an_acknowledgement_that_reached_nobody_leaves_the_alarm_open(visit, stage: Stage, path):
+    page = visit(path, expect_gone=True, **PHONE)
+    if path == "/phone":
+        choose(page, "Anna")
+    page.route("**/api/acknowledge", lambda route: route.abort())
+    stage.team.still_since[2] = stage.at_s - 31.0
+    page.get_by_role("button", name="Acknowledge: Ben").click()
+    expect(page.locator("#notices")).to_contain_text("Not acknowledged")
+    expect(page.locator("#alarms .rows .alarm")).to_contain_text("Ben has not moved")
+    page.unroute("**/api/acknowledge")
+    page.get_by_role("button", name="Acknowledge: Ben").click()
+    wait_for(lambda: stage.acknowledged == [2])
+    expect(page.locator("#alarms .known")).to_contain_text("Ben has not moved")
+
+
 def test_the_phones_page_works_on_the_smallest_screen_by_keyboard(visit, stage: Stage):
     page = visit("/phone", viewport={"width": 320, "height": 568})
     choose(page, "Fatima")

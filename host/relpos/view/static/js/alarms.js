@@ -71,9 +71,9 @@ export class Alarms {
     return { raised, cleared };
   }
 
-  acknowledge(node, by = "") {
+  acknowledge(node, by = "", acknowledged = true) {
     const alarm = this.active.get(node);
-    if (alarm) this.active.set(node, { ...alarm, acknowledged: true, by });
+    if (alarm) this.active.set(node, { ...alarm, acknowledged, by });
   }
 
   /** The worst first: unacknowledged before acknowledged, by priority, then the oldest. */

@@ -277,9 +277,17 @@ async function acknowledge(nodes) {
   for (const node of nodes) alarms.acknowledge(node, by);
   sound();
   banner.update(alarms);
+  const unsent = new Set(nodes);
   try {
-    for (const node of nodes) await postJson("/api/acknowledge", { node, by });
+    for (const node of nodes) {
+      await postJson("/api/acknowledge", { node, by });
+      unsent.delete(node);
+    }
   } catch (error) {
+    // Nobody else knows of it: it is open again.
+    for (const node of unsent) alarms.acknowledge(node, "", false);
+    sound();
+    banner.update(alarms);
     say(t("acknowledge.failed", { error: error.message }));
   }
 }
