@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import time
 from array import array
@@ -11,9 +12,11 @@ from dataclasses import replace
 import pytest
 from sessions import PulledOut, about, play, session
 
+from relpos.cli.replay import Played
 from relpos.cli.smoothing import Smoothing
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.live.mission import JOURNAL, Journal, Mission
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
@@ -220,6 +223,28 @@ def test_alerts_of_a_moment_are_those_that_were_then():
     posts = History()
     posts.read(Rows(), {}, (), frozenset({2}))
     assert posts.alert(2, 42.0)[1] is None, "the command post's node lies still"
+
+
+def test_the_replay_of_a_mission_shows_who_called_mayday_from_then_until_it_was_over(
+    recorded, tmp_path
+):
+    mission = Mission.open(tmp_path / "mission", "/dev/ttyUSB0")
+    mission.about.sessions = 1
+    mission.save()
+    shutil.copy(recorded[0], mission.recording(1))
+    journal = Journal(mission.path / JOURNAL)
+    for time_s, node, on in ((12.05, 2, True), (13.0, 9, True), (22.0, 2, False)):
+        said = {"kind": "mayday", "node": node, "on": on, "by": "Ben"}
+        journal.keep({**said, "time_s": time_s, "unix_s": 1.8e9 + time_s})
+    journal.close()
+    played = Played.open(mission.path)
+    player = Player(Moments(played.paths), [], played.entries, calls=played.calls)
+    player.wait()
+
+    def callers(time_s):
+        return [p.node for p in player.view(time_s).people if p.alert is Alert.MAYDAY]
+
+    assert [callers(at_s) for at_s in (12.0, 12.1, 13.1, 23.0)] == [[], [2], [2, 9], [9]]
 
 
 def test_a_fall_is_an_alert_of_a_recording_too():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,7 @@ from relpos.errors import DataError
 if TYPE_CHECKING:
     from relpos.live.team_view import LogEntry
     from relpos.recording.moments import Moments
+    from relpos.recording.player import Call
 
 
 def replay(
@@ -57,6 +59,7 @@ class Played:
     entries: list[LogEntry]
     board: dict[str, Any]
     live_port: int | None = None
+    calls: tuple[tuple[float, Call], ...] = ()
 
     @classmethod
     def open(cls, source: Path) -> Played:
@@ -64,6 +67,7 @@ class Played:
         from relpos import recording
         from relpos.live.board import Board, BoardError
         from relpos.live.mission import Mission
+        from relpos.recording.player import Call  # needs a library, which is looked for first
 
         recording.check(None)
         board = Board()
@@ -71,17 +75,22 @@ class Played:
             return cls([source], source.stem, [], board.to_message())
         mission = Mission.open(source)
         entries: list[LogEntry] = []
+        calls: list[tuple[float, Call]] = []
         for event in mission.events():
             if event["kind"] == "log":
                 entries.append(event["entry"])
             elif event["kind"] in ("marker", "plan"):
                 with contextlib.suppress(BoardError):
                     board.apply(event)
+            elif event["kind"] == "mayday" and {"node", "time_s"} <= event.keys():
+                calls.append((event["time_s"], Call(event["node"], bool(event.get("on")))))
         paths = mission.recordings()
         if not paths:
             raise DataError(f"{source}: nothing is recorded yet")
         live_port = mission.about.port if mission.is_running() else None
-        return cls(paths, mission.about.name, entries, board.to_message(), live_port)
+        calls.sort(key=itemgetter(0))
+        name, message = mission.about.name, board.to_message()
+        return cls(paths, name, entries, message, live_port, tuple(calls))
 
 
 def play(
@@ -111,7 +120,7 @@ def play(
     page.boarded(played.board)
     # A mission that goes on has no end yet to smooth from.
     smoothing = None if live_port else Smoothing(played.paths)
-    player = Player(moments, [page], played.entries, smoothing, admit)
+    player = Player(moments, [page], played.entries, smoothing, admit, played.calls)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             player.run(options.seconds)

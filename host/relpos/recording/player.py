@@ -6,6 +6,7 @@ reading of the whole recording, in a thread, while the page is open already.
 
 from __future__ import annotations
 
+import heapq
 import math
 import sys
 import threading
@@ -13,7 +14,8 @@ import time
 from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 from relpos.fusion.estimator import NodeStatus
@@ -47,6 +49,14 @@ SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 TICK_KINDS = ("alarm", "landmark", "rollcall", "mayday", "evacuate", "note", "warning")
 
 
+@dataclass(frozen=True)
+class Call:
+    """A MAYDAY of a mission's journal, or its end."""
+
+    node: int
+    on: bool
+
+
 class History:
     """What one reading of the recording finds: who was heard when, alerts, events."""
 
@@ -74,8 +84,12 @@ class History:
         names: dict[int, str],
         known: Sequence[LogEntry],
         posts: frozenset[int] = frozenset(),
+        calls: Sequence[tuple[float, Call]] = (),
     ) -> None:
-        """Read everything once; ``known`` is a mission's log, else the alerts make one."""
+        """Read everything once; ``known`` is a mission's log, else the alerts make one.
+
+        ``calls`` are the MAYDAYs of a mission, with the time of each.
+        """
         alarms, log = Alarms(), list(known)
         alarms.posts = posts
 
@@ -88,20 +102,24 @@ class History:
 
         kinds = (Motion, Height, Event, Status)
         ticked_s = -math.inf
-        for time_s, row in moments.rows(moments.from_s, moments.to_s, *kinds):
+        rows = moments.rows(moments.from_s, moments.to_s, *kinds)
+        for time_s, row in heapq.merge(rows, calls, key=itemgetter(0)):
             if isinstance(row, Event):
                 # Of a simulated run: what is true (episodes, foot contacts) is no news.
                 if row.event == PRESS and not known:
                     words = AT_LANDMARK.filled(name=name(row.node), landmark=row.value)
                     note(time_s, "landmark", words, row.node)
                 continue
-            self.heard_s.setdefault(row.node, array("d")).append(time_s)
-            alarms.mark_heard(row.node)
+            if isinstance(row, Call):
+                (alarms.mayday.add if row.on else alarms.mayday.discard)(row.node)
+            else:
+                self.heard_s.setdefault(row.node, array("d")).append(time_s)
+                alarms.mark_heard(row.node)
             if isinstance(row, Motion):
                 alarms.add_motion(row)
             elif isinstance(row, Height):
                 alarms.add_height(row)
-            if time_s < ticked_s + TICK_S:
+            if time_s < ticked_s + TICK_S and not isinstance(row, Call):
                 continue
             ticked_s = time_s
             alarms.tick(time_s, listening=True)
@@ -118,8 +136,8 @@ class Player:
     """Shows a recording to ``sinks``, and does what their users ask (kind ``replay``).
 
     ``smoothed`` returns the smoothed tracks once they are computed, None before. ``admit`` keeps a
-    device that a mission's page lets in or shuts out. Afterwards ``ended`` is whether somebody on
-    the page has ended it.
+    device that a mission's page lets in or shuts out. ``calls`` are a mission's MAYDAYs. Afterwards
+    ``ended`` is whether somebody on the page has ended it.
     """
 
     def __init__(
@@ -129,6 +147,7 @@ class Player:
         log: Iterable[LogEntry] = (),
         smoothed: Callable[[], Tracks | None] | None = None,
         admit: Callable[[dict[str, Any]], None] | None = None,
+        calls: Sequence[tuple[float, Call]] = (),
     ) -> None:
         self.ended = False
         self._admit = admit
@@ -144,13 +163,13 @@ class Player:
         self._told = False
         self._smoothed = smoothed
         self._reader = threading.Thread(
-            target=self._read, args=(list(log),), name="history", daemon=True
+            target=self._read, args=(list(log), calls), name="history", daemon=True
         )
         self._reader.start()
 
-    def _read(self, log: list[LogEntry]) -> None:
+    def _read(self, log: list[LogEntry], calls: Sequence[tuple[float, Call]]) -> None:
         # The thread has files of its own: two positions in one would meet.
-        self.history.read(self.moments.again(), self.names, log, self.posts)
+        self.history.read(self.moments.again(), self.names, log, self.posts, calls)
 
     def wait(self) -> None:
         """Wait until the whole recording is read."""
@@ -258,7 +277,7 @@ class Player:
         newest: dict[tuple[int, int], Range] = {}
         for _, row in self.moments.rows(time_s - BACK_S, time_s, Range):
             newest[min(row.node, row.peer), max(row.node, row.peer)] = row
-        nodes = sorted(located.keys() | self.history.heard_s.keys())
+        nodes = sorted(located.keys() | self.history.heard_s.keys() | self.history.alerts.keys())
         return TeamView(
             seq=self._seq,
             time_s=time_s,
