@@ -20,6 +20,7 @@ from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.link import xbee
 from relpos.live.assembly import MissionPlan, SessionPlan
+from relpos.live.board import Board
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import PacedInput, Received
 from relpos.live.mission import JOURNAL, TRACKS, Journal, Mission, MissionFiles, read_again
@@ -246,6 +247,30 @@ def test_a_damaged_checkpoint_costs_the_map_and_no_more(tmp_path: Path, damage: 
     assert resumed.priors == ()
     assert resumed.tracks.of(1) == [(2.0, 3.0, 4.0)]
     assert isinstance(resumed.tracks, Tracks)
+
+
+def test_a_damaged_checkpoint_leaves_no_plan_aligned_and_no_tracks_of_the_map_before(tmp_path):
+    mission = Mission.open(tmp_path / "mill", "loop://")
+    mission.about.sessions = 1
+    mission.save()
+    journal = Journal(mission.path / JOURNAL)
+    laid = {"kind": "plan", "image": "mill.png", "time_s": 1.0, "unix_s": 1.8e9}
+    journal.keep({**laid, "action": "set"})
+    journal.keep({**laid, "action": "align", "points": [[0, 0, 0, 0], [9, 0, 9, 0]]})
+    journal.close()
+    (mission.path / TRACKS).write_text("1,2.0,3.0,4.0\n")
+    (mission.path / "checkpoint.json").write_text("{")
+    again = ("mission", mission.path, "--estimator", "deadreckoning", "--no-open", "--seconds")
+    told = relpos(*again, "1").stderr
+    assert "the map begins anew" in told
+    board = Board()
+    for event in mission.events():
+        if event["kind"] == "plan":
+            board.apply(event)
+    assert board.plan is not None, "it lies there still"
+    assert board.plan.points == []
+    assert not (mission.path / TRACKS).exists()
+    assert (mission.path / "tracks-1.csv").read_text() == "1,2.0,3.0,4.0\n"
 
 
 @pytest.mark.parametrize("x_m", [math.nan, math.inf, 1e300, "x", None, True])

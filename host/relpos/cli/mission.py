@@ -193,6 +193,8 @@ def _run(
     from relpos.runs import Description
 
     about, resumed = found.about, found.resume()
+    if resumed.on_new_map:
+        found.put_tracks_away(resumed)
     jumped = found.keep_time(resumed)
     if jumped is not None:
         output.remark(jumped)
@@ -243,7 +245,7 @@ def _earlier(
     from relpos.live.mission import WARM_UP_S, read_again
     from relpos.recording import open_recording
 
-    if resumed.begins or resumed.since_s > 0.0:
+    if not resumed.on_new_map:
         # What is read again came before the counters that were stored.
         link.decoder.expect_from_start()
         chosen: list[Recording] = []

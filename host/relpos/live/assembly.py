@@ -109,6 +109,8 @@ def run_session(
     if kept is not None and journal is not None:
         session.keep(journal, kept.resumed)
         session.add_sink(MissionFiles(kept.folder, journal, kept.resumed.since_s))
+        if kept.resumed.on_new_map:
+            session.begin_map()
         for sink in sinks:
             sink.resumed(kept.resumed.tracks)
     link = source.link

@@ -108,6 +108,11 @@ class Resumed:
     """When the newest bytes arrived then: an emulated team has a time of its own."""
     tracks: Tracks = field(default_factory=Tracks)
 
+    @property
+    def on_new_map(self) -> bool:
+        """Whether the checkpoint is damaged, so that nothing fits the map any more."""
+        return not self.begins and self.since_s == 0.0
+
 
 class Mission:
     """The folder of a mission. DataError where it is none, or cannot be written."""
@@ -216,6 +221,12 @@ class Mission:
                 where = [_bounded(*row) for row in zip(names, map(float, point), strict=True)]
                 resumed.tracks.add(int(node), *where)
         return resumed
+
+    def put_tracks_away(self, resumed: Resumed) -> None:
+        """Keep the tracks of another map apart from those that come."""
+        resumed.tracks = Tracks()
+        with contextlib.suppress(FileNotFoundError):
+            (self.path / TRACKS).replace(self.path / f"tracks-{self.about.sessions}.csv")
 
     def is_running(self) -> bool:
         """Return whether a session has this mission now."""

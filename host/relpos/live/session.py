@@ -51,6 +51,11 @@ BEHIND_S = 5.0
 ASLEEP_S = 5.0
 """The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
 FAILED = Said("session-failed", "the session has failed")
+NEW_MAP = Said(
+    "new-map",
+    "the checkpoint is damaged: the map begins anew, without the tracks before; markers may lie "
+    "wrong, a plan has to be aligned again",
+)
 EVENTS = ("acknowledge", "shelve", "name", "device")
 """Requests that change what a mission keeps."""
 LOGGED = ("acknowledge", "shelve", "name")
@@ -145,6 +150,12 @@ class LiveSession:
                     self._apply(event)
         self._again_s = resumed.since_s
         self._journal = journal
+
+    def begin_map(self) -> None:
+        """Tell that the map begins anew; a plan that was aligned fits it no more."""
+        if self._board.plan is not None and self._board.plan.points:
+            self._happen({"kind": "plan", "action": "align", "points": []})
+        self.post("new-map", Level.WARNING, NEW_MAP)
 
     def add_sink(self, sink: Sink) -> None:
         """Feed one more sink from now on."""
