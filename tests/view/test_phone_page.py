@@ -212,6 +212,26 @@ def test_an_acknowledgement_that_reached_nobody_leaves_the_alarm_open(visit, sta
     expect(page.locator("#alarms .known")).to_contain_text("Ben has not moved")
 
 
+def test_find_on_a_phone_says_where_else_an_ambiguous_person_may_be(visit, stage: Stage):
+    stage.frozen = True
+    stage.team.ambiguous = 2
+    poses = {1: (0.0, 0.0, 0.0), 2: (10.0, 0.0, 0.0)}
+    stage.team.pose = lambda node, time_s: poses.get(node, (20.0, float(node), 0.0))
+    page = visit("/phone", **PHONE)
+    choose(page, "Anna")
+    page.get_by_role("button", name="Team", exact=True).click()
+    page.get_by_role("button", name="Find Ben").click()
+    caution = page.locator("#find .caution")
+    expect(caution).to_contain_text("Ben may be elsewhere: 62 % where shown. Or, 29 %: 9 m")
+    # There Ben is (-4, 7) m from where he is shown: (6, 7) m from Anna, who looks along x.
+    expect(caution).to_contain_text("10 o'clock, ahead left")
+    poses[1] = (0.0, 0.0, math.pi)
+    expect(caution).to_contain_text("behind right")
+    # What moves a third person is no other place of these two.
+    stage.team.ambiguous = 3
+    expect(caution).to_be_hidden()
+
+
 def test_the_phones_page_works_on_the_smallest_screen_by_keyboard(visit, stage: Stage):
     page = visit("/phone", viewport={"width": 320, "height": 568})
     choose(page, "Fatima")

@@ -6,7 +6,7 @@ import { arrow, make, setAttribute, setHidden, setText } from "./dom.js";
 import { Announcer, guidance, isThere, spoken, Trend } from "./finding.js";
 import { apartWords, floorsApart } from "./floors.js";
 import { current, number, t } from "./i18n.js";
-import { ago, distance, nodeName, plusMinus, probability } from "./words.js";
+import { ago, distance, nodeName, plusMinus, probability, whereabouts } from "./words.js";
 
 const TREND_SIGNS = { warmer: "▲", colder: "▼", same: "=" };
 
@@ -117,11 +117,12 @@ export class FindView {
     setText(this.trendWords, t(`find.${trend ?? "walk"}`));
     setText(this.sure, accuracyWords(seeker, target, relation));
     const caution = cautions(team, seeker, target, connected);
-    setText(this.caution, caution);
-    setHidden(this.caution, caution === "");
+    const other = fresh && !last ? elsewhereWords(team, this.from, this.to) : "";
+    setText(this.caution, `${caution} ${other}`.trim());
+    setHidden(this.caution, this.caution.textContent === "");
     const key = `${guide.key} ${floor} ${caution.replace(/\d+/g, "")}`;
     if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
-      this.say(`${spoken(last ? t("find.last.spoken", { name: targetName }) : targetName, relation, guide, trend)} ${this.floor.textContent} ${caution}`.trim());
+      this.say(`${spoken(last ? t("find.last.spoken", { name: targetName }) : targetName, relation, guide, trend)} ${this.floor.textContent} ${this.caution.textContent}`.trim());
     }
   }
 
@@ -148,6 +149,13 @@ export function accuracyWords(seeker, target, relation) {
     if (Number.isFinite(person.sigma_major_m)) parts.push(`${person.name} ${plusMinus(person.sigma_major_m)}`);
   }
   return parts.join(" · ");
+}
+
+/** Where else the other may be, as the seeker sees it; a phone has no map that shows it. */
+function elsewhereWords(team, from, to) {
+  const other = team.elsewhere(from, to);
+  if (!other) return "";
+  return t("caution.or", { probability: probability(other.probability), where: whereabouts(other.relation, team.northRad) });
 }
 
 /** Reasons for caution; empty where there are none. */

@@ -223,6 +223,28 @@ export class Team {
     return this.possibleNow;
   }
 
+  /**
+   * How `from` sees `to` where the most probable other alternative has them: {relation, probability};
+   * null where there is none. One that moves others alone is no other.
+   */
+  elsewhere(from, to) {
+    const { shown } = this.possible();
+    const at = (alternative, node) => alternative?.people.find((p) => p.node === node && p.shape !== "ring");
+    const groups = [];
+    for (const alternative of this.alternatives) {
+      if (![from, to].every((node) => at(alternative, node) && at(shown, node))) continue;
+      const same = (other) => [from, to].every((node) => isSamePlace(at(alternative, node), at(other, node)));
+      if (same(shown)) continue;
+      const group = groups.find(({ first }) => same(first));
+      if (group) group.probability += alternative.probability;
+      else groups.push({ first: alternative, probability: alternative.probability });
+    }
+    const [best] = groups.sort((a, b) => b.probability - a.probability);
+    if (!best || best.probability < MIN_PROBABILITY) return null;
+    const placed = (node) => ({ ...this.person(node), ...at(best.first, node) });
+    return { relation: relation(placed(from), placed(to)), probability: best.probability };
+  }
+
   distanceFromShown(alternative) {
     let [sum, count] = [0, 0];
     for (const ghost of alternative.people) {
