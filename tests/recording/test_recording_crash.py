@@ -15,10 +15,11 @@ import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from sessions import PulledOut, about, alike, play, session
+from sessions import START_NS, PulledOut, about, alike, play, session
 
 from relpos.recording import make_recorder, open_recording, save_recording
 from relpos.recording.container import Walk
+from relpos.recording.moments import Moments
 from relpos.recording.output import Disk
 from relpos.recording.recorder import Bounds, Recorder
 from relpos.recording.topics import Serial
@@ -165,6 +166,41 @@ def test_a_damaged_block_is_left_out_and_reported(tmp_path):
     recording = open_recording(path)
     assert 0 < len(serials(path)) < whole
     assert recording.remarks == (f"{path}: 1 damaged blocks are left out",)
+
+
+@pytest.mark.parametrize(
+    ("place", "damage"),
+    [
+        (0, bytes(4096)),
+        (0, bytes(13_000)),
+        (100, b"\xff" * 40),
+        (b"started_unix_ns", b"\xff" * 15),
+        (b"settings", b"\xff" * 8),
+        (b"/serial", b"\xff" * 7),
+        (b"/motion", b"/nation"),
+    ],
+)
+def test_a_damaged_beginning_costs_nothing_behind_it_and_is_told(tmp_path, place, damage):
+    path = tmp_path / "damaged.mcap"
+    recorder = make_recorder(path, about())
+    play(recorder, session())
+    recorder.close()
+    whole = open_recording(path).run.measurements
+    inputs = list(open_recording(path).inputs())
+    data = bytearray(path.read_bytes())
+    at = place if isinstance(place, int) else data.index(place)
+    data[at : at + len(damage)] = damage
+    path.write_bytes(data)
+    recording = open_recording(path)
+    assert recording.run.measurements == whole
+    assert list(recording.inputs()) == inputs
+    assert recording.started_unix_ns == pytest.approx(START_NS, abs=2)
+    assert "its beginning is damaged" in recording.remarks[0]
+    anew = tmp_path / "anew.mcap"
+    save_recording(anew, recording.run, source=recording)
+    assert open_recording(anew).remarks == ()
+    assert open_recording(anew).run.measurements == whole
+    assert Moments([anew]).estimate_at(30.0) is not None
 
 
 def in_blocks(recorder, path, count):

@@ -190,9 +190,12 @@ class Walk:
     def __iter__(self) -> Iterator[Piece]:
         """Yield what stands before the end of the data; nothing where it is no MCAP at all."""
         self.file.seek(0)
-        if self.file.read(len(MAGIC)) != MAGIC:
-            return
         self.end = len(MAGIC)
+        if self.file.read(len(MAGIC)) != MAGIC:
+            self.end = self._next_chunk() or 0
+            if self.end == 0:
+                return
+            self.gaps.append(self.end)
         while self.end + HEAD_BYTES <= self.size:
             self.file.seek(self.end)
             opcode, length = struct.unpack("<BQ", self.file.read(HEAD_BYTES))
@@ -432,6 +435,9 @@ def copy_blocks(
         if not beginning and piece.opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
             continue
         payload = walk.payload(piece)
+        if piece.opcode == Opcode.METADATA and not _is_whole(Metadata, payload):
+            lost += piece.length
+            continue
         indexes = b""
         if piece.opcode == Opcode.CHUNK:
             try:
@@ -444,6 +450,14 @@ def copy_blocks(
             newest = max(newest, last)
         out.write(struct.pack("<BQ", piece.opcode, piece.length - HEAD_BYTES) + payload + indexes)
     return lost + sum(walk.gaps) + (0 if walk.complete else walk.size - walk.end), newest
+
+
+def _is_whole(kind: Any, payload: bytes) -> bool:
+    try:
+        parse(kind, payload)
+    except ValueError:
+        return False
+    return True
 
 
 def _message_indexes(raw: bytes) -> tuple[bytes, int]:

@@ -32,7 +32,7 @@ from relpos.recording.container import (
     unpack,
 )
 from relpos.recording.output import parts_of
-from relpos.recording.reader import UNREADABLE, opened, parsed
+from relpos.recording.reader import MAKE_WHOLE, UNREADABLE, opened, parsed
 from relpos.runs.description import Description
 
 BACK_S = 10.0
@@ -95,6 +95,8 @@ class Moments:
                 elif piece.opcode == Opcode.CHANNEL:
                     channel = parsed(paths[number], Channel, walk.payload(piece))
                     names[channel.id] = channel.topic
+                elif walk.gaps and not blocks:
+                    raise DataError(f"{paths[number]}: its beginning is damaged; {MAKE_WHOLE}")
                 elif piece.opcode == Opcode.CHUNK and piece.length >= HEAD_BYTES + 16:
                     start_ns, end_ns = struct.unpack("<QQ", walk.payload(piece, 16))
                     blocks.append(_Block(start_ns, end_ns, number, piece))

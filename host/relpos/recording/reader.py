@@ -24,6 +24,7 @@ from relpos.recording.container import (
     Entry,
     Piece,
     Walk,
+    numbered,
     parse,
     records_in,
     unpack,
@@ -50,6 +51,20 @@ class _File:
     closed: bool
     first_ns: int | None
     last_ns: int | None
+    head_damaged: bool = False
+    """Whether something before its first block is not what was written."""
+
+    def supply_channels(self) -> None:
+        """Take those of our files for channels whose own records are damaged."""
+        ours = numbered(all_topics())
+        known = [(n, ours[c.topic]) for n, c in self.channels.items() if c.topic in ours]
+        if sum(n == number for n, number in known) < len(known) / 2:
+            return  # Another version's, which numbers them in another way.
+        for name, number in ours.items():
+            odd = self.channels.get(number)
+            if odd is None or odd.topic not in ours:
+                self.head_damaged |= odd is not None
+                self.channels[number] = Channel(number, name, "json", {}, number)
 
 
 @dataclass
@@ -71,7 +86,11 @@ class Recording:
         about: About | None = None
         for part in parts_of(path):
             found = _look_through(part)
-            its = About.read(str(part), found.metadata)
+            its = None
+            try:
+                its = About.read(str(part), found.metadata)
+            except DataError:
+                found.head_damaged = True
             if files and (
                 about is None or its is None or its.started_unix_ns != about.started_unix_ns
             ):
@@ -83,7 +102,21 @@ class Recording:
         there = {channel.topic for file in files for channel in file.channels.values()}
         if about is None and files[0].channels and not known & there:
             raise DataError(f"{path}: an MCAP file, but no recording of relpos: none of its topics")
-        return cls(path, about, files)
+        for file in files:
+            if about is not None or file.head_damaged:
+                file.supply_channels()
+        recording = cls(path, about, files)
+        if about is None and files[0].head_damaged:
+            recording.about = recording._about_by_content()
+        return recording
+
+    def _about_by_content(self) -> About | None:
+        """What can be said of a session whose recording's head is damaged; None where nothing."""
+        for entry, entered in self._decoded({topics.SERIAL, *_OBSERVED}, _input):
+            at_s = entered.arrival_s if entry.topic == topics.SERIAL else entered.time_s
+            # Its bytes alone do not say whether it went on from a session before.
+            return About(entry.publish_ns - round(at_s * 1e9), resumed=True)
+        return None
 
     @property
     def started_unix_ns(self) -> int | None:
@@ -107,6 +140,11 @@ class Recording:
         """Remarks about the recording, a line each."""
         remarks: list[str] = []
         for file in self.files:
+            if file.head_damaged:
+                remarks.append(
+                    f"{file.path}: its beginning is damaged: what it says of its session "
+                    "(estimator, names, starts) may be missing"
+                )
             if file.damaged:
                 remarks.append(f"{file.path}: {file.damaged} damaged blocks are left out")
             if file in self._cut_off:
@@ -293,20 +331,26 @@ def _look_through(path: Path) -> _File:
     found = _File(path, {}, {}, 0, 0, closed=False, first_ns=None, last_ns=None)
     with opened(path) as stream:
         start = stream.read(len(MAGIC))
-        if start != MAGIC[: len(start)]:
-            raise DataError(f"{path}: no MCAP file")
-        walk = Walk(stream)
+        walk, blocks = Walk(stream), 0
         for piece in walk:
-            if piece.opcode == Opcode.METADATA:
-                record = parsed(path, Metadata, walk.payload(piece))
-                found.metadata[record.name] = record.metadata
-            elif piece.opcode == Opcode.CHANNEL:
-                channel = parsed(path, Channel, walk.payload(piece))
-                found.channels[channel.id] = channel
-            elif piece.opcode == Opcode.CHUNK:
+            blocks += piece.opcode == Opcode.CHUNK
+            found.head_damaged |= blocks == 1 and bool(walk.gaps)
+            try:
+                if piece.opcode == Opcode.METADATA:
+                    record = parse(Metadata, walk.payload(piece))
+                    found.metadata[record.name] = record.metadata
+                elif piece.opcode == Opcode.CHANNEL:
+                    channel = parse(Channel, walk.payload(piece))
+                    found.channels[channel.id] = channel
+            except ValueError:
+                found.head_damaged |= blocks == 0
+                found.damaged += blocks > 0
+            if piece.opcode == Opcode.CHUNK:
                 _look_into(found, walk.payload(piece))
             elif piece.opcode == Opcode.MESSAGE:
                 found.damaged += piece.length < HEAD_BYTES + MESSAGE_HEAD.size
+        if start != MAGIC[: len(start)] and not blocks:
+            raise DataError(f"{path}: no MCAP file")
         found.damaged += len(walk.gaps)
         found.unread = 0 if walk.complete else walk.size - walk.end
         found.closed = walk.complete
@@ -344,4 +388,7 @@ def parsed(path: Path, kind: Any, payload: bytes) -> Any:
     try:
         return parse(kind, payload)
     except ValueError as error:
-        raise DataError(f"{path}: damaged: {error}") from None
+        raise DataError(f"{path}: damaged: {error}; {MAKE_WHOLE}") from None
+
+
+MAKE_WHOLE = "`relpos convert FILE --to mcap --out NEW` writes anew what is behind it"

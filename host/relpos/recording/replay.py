@@ -48,8 +48,9 @@ class Replay:
         if about is not None and about.resumed:
             # Its bytes alone make the first motion of each node all of it since the node's start.
             self.remarks = (
-                f"{self.recording.path}: the session went on from one before: the measurements are "
-                "those that were decoded when it was recorded",
+                f"{self.recording.path}: the session went on from one before, or the recording's "
+                "beginning is damaged: the measurements are those that were decoded when it was "
+                "recorded",
             )
             return
         self.link = Link(key=self.key, newest_counters=about.newest_counters if about else None)
