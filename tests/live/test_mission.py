@@ -32,8 +32,9 @@ from relpos.live.tracks import Tracks
 from relpos.measurements import Motion
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
-from relpos.recording import make_recorder
+from relpos.recording import make_recorder, open_recording
 from relpos.recording.about import About
+from relpos.recording.moments import Moments
 from relpos.runs import Description
 from support.command import relpos
 
@@ -145,6 +146,41 @@ def test_a_session_that_was_killed_goes_on_with_the_same_map_names_and_alarms(tm
                 sigma_m = math.sqrt(n.variance_x_m2 + n.variance_y_m2)
                 assert math.hypot(n.x_m - x_m, n.y_m - y_m) < 3.0 * sigma_m < 12.0, "the same map"
         assert min(e.time_s for e in album.estimates) > again.since_s
+
+
+def test_the_recording_of_a_session_that_goes_on_has_the_seconds_since_the_checkpoint(tmp_path):
+    mission = Mission.open(tmp_path / "mill", "emulated")
+    with EmulatedTeam(TeamConfig("paper", 3, 70.0, 3, beacons=True)) as team:
+        source, paths = TeamInput(team), [mission.recording(n) for n in (1, 2)]
+        resumed = mission.resume()
+        resumed.priors = tuple(team.priors())
+        session, _, _ = made(team, source, resumed, mission, make_recorder(paths[0], About(0)))
+        play(session, lambda: source.now_s() > 30.0)
+        session.finish()
+        team.run(team.time_us + 10_000_000)
+        again = mission.resume()
+        first = open_recording(paths[0])
+        source = Again(team, lambda link: read_again(first.inputs(), link.feed, again))
+        session, _, _ = made(team, source, again, mission, make_recorder(paths[1], About(0)))
+        play(session, lambda: source.now_s() > 56.0)
+        session.finish()
+    later = open_recording(paths[1])
+
+    def moved(recording, until_s):
+        motions = (o for o in recording.observations() if isinstance(o, Motion))
+        return {(o.node, o.dx_m) for o in motions if again.since_s + 0.1 < o.time_s < until_s}
+
+    killed_s = max(o.time_s for o in first.observations())
+    assert killed_s > again.since_s + 0.5
+    assert moved(later, killed_s + 0.1) == moved(first, killed_s + 0.1) != set()
+    assert min(s for s, _ in later.observations_by_arrival()) > again.since_s
+    # Played as one, nothing is there twice.
+    moments = Moments(paths)
+    heard = [(s, row.node, row.time_s) for s, row in moments.rows(0.0, 70.0, Motion)]
+    assert len({row[1:] for row in heard}) == len(heard)
+    assert [s for s, *_ in heard] == sorted(s for s, *_ in heard)
+    assert moments.estimate_at(39.0).time_s > killed_s - 1.5
+    assert Moments([paths[1]]).from_s > again.since_s
 
 
 def test_what_a_request_says_beside_its_own_is_dropped_and_costs_it_nothing(tmp_path):

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -259,8 +260,8 @@ def _earlier(
             # A session that received nothing has nothing of the seconds before the checkpoint.
             if first is not None and first[0] <= resumed.arrived_s - WARM_UP_S:
                 break
-        for recording in chosen:
-            yield from read_again(recording.inputs(), link.feed, resumed)
+        inputs = chain.from_iterable(recording.inputs() for recording in chosen)
+        yield from read_again(inputs, link.feed, resumed)
     link.decoder.expect_after(counters)
 
 

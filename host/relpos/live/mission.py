@@ -413,13 +413,17 @@ def read_again(
 ) -> Iterator[Received]:
     """Yield recorded inputs once more; of those before the checkpoint only the link learns.
 
-    ``feed(data, arrival_s)`` decodes bytes.
+    ``feed(data, arrival_s)`` decodes bytes. What phones sent may stand in two recordings: a session
+    that went on has taken in what it had read again.
     """
     since_s = resumed.since_s
+    phones: set[Any] = set()
     for arrival_s, entered in inputs:
-        if arrival_s < resumed.arrived_s - WARM_UP_S:
+        if arrival_s < resumed.arrived_s - WARM_UP_S or entered in phones:
             continue
         data = getattr(entered, "data", None)
+        if data is None:
+            phones.add(entered)
         observations: Sequence[Any] = (entered,) if data is None else feed(data, arrival_s)
         known = tuple(o for o in observations if o.time_s > since_s)
         yield Received(arrival_s, b"", known, again=True)

@@ -248,9 +248,7 @@ class LiveSession:
         decoder = link.decoder if link else None
         with self._surviving("view"):
             self._composer.add_observations(now_s, received.observations, decoder)
-        if received.again:
-            self._fusion.submit(received.observations)
-        elif received.observations:
+        if received.observations:
             self._submit(received.arrival_s, received.observations)
         self._changed = True
 

@@ -7,6 +7,7 @@ has one as well. Several recordings of one mission are one, on the mission's clo
 from __future__ import annotations
 
 import struct
+import sys
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
@@ -82,8 +83,11 @@ class Moments:
         """Blocks that were seen to hold no estimate."""
         self._starts_ns: list[int] = []
         """Unix time of second 0 in each file: where a computer's clock was set, it differs."""
+        self._begins_ns: list[int] = []
+        """Rows up to there were read again in that session: the recording before has them."""
         seen: set[tuple[int, int, int]] = set()
         about: About | None = None
+        begins_ns = 0
         for number, walk in enumerate(self._walks):
             metadata: dict[str, dict[str, str]] = {}
             names: dict[int, str] = {}
@@ -105,6 +109,9 @@ class Moments:
             before_ns = about.started_unix_ns if about is not None else 0
             zero_ns = before_ns if found is None else found.started_unix_ns
             self._starts_ns.append(zero_ns)
+            if paths[number] in self._paths:
+                begins_ns = max((block.end_ns for block in self._blocks), default=-sys.maxsize)
+            self._begins_ns.append(begins_ns)
             if paths[number] not in self._paths and (found is None or zero_ns != before_ns):
                 continue  # Another recording's, by its name alone a part of this.
             about = found if found is not None else about
@@ -158,7 +165,8 @@ class Moments:
                 if opcode == Opcode.MESSAGE:
                     channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
                     topic = names.get(channel, "")
-                    if topic in _READ:
+                    is_new = topic in _LISTS or log_ns - zero_ns > self._begins_ns[block.file]
+                    if topic in _READ and is_new:
                         data = bytes(content[MESSAGE_HEAD.size :])
                         messages.append(Message((log_ns - zero_ns) * 1e-9, topic, data))
         except ValueError:
