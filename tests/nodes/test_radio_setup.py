@@ -163,6 +163,34 @@ def test_a_module_that_speaks_frames_is_set_by_frames(escaped):
     assert module.module._settings[b"RN"] == b"\3"
 
 
+class Lossy:
+    """A module some of whose answers are lost."""
+
+    def __init__(self, module, lost):
+        self.module = module
+        self.lost = lost
+        self.answers = 0
+
+    @property
+    def baud(self):
+        return self.module.baud
+
+    def update_without_link(self, data):
+        answer = self.module.update_without_link(data)
+        self.answers += bool(answer)
+        return b"" if answer and self.answers in self.lost else answer
+
+
+@pytest.mark.parametrize("make", [FromTheShelf, partial(Emulated, 9)])
+def test_a_lost_answer_is_asked_for_again(monkeypatch, make):
+    monkeypatch.setattr(radio, "GUARD_S", 0.1)
+    module = Lossy(make(), {4, 12, 13, 24})
+    with adapter(module) as path:
+        written = radio.configure(partial(open_port, path), radio.parameters(3, 0x4242, 0x0E))
+    assert module.answers > 24
+    assert [w.parameter.command for w in written][-2:] == ["AP", "BD"]
+
+
 def test_a_port_without_a_module_is_reported(monkeypatch):
     monkeypatch.setattr(radio, "GUARD_S", 0.01)
     monkeypatch.setattr(radio, "ANSWER_S", 0.02)

@@ -28,6 +28,8 @@ GUARD_S = 1.1
 ANSWER_S = 0.5
 """A module answers within some 10 ms; writing its memory takes longer."""
 WRITE_S = 2.0
+ATTEMPTS = 3
+"""A command may be asked again: it sets, or says, the same."""
 _STATUS = {1: "error", 2: "unknown command", 3: "bad value"}
 
 
@@ -129,8 +131,12 @@ class CommandMode:
                 raise DeviceError(f"the XBee module does not confirm {command}")
 
     def _ask(self, line: str, wait_s: float = ANSWER_S) -> str:
-        _write(self.device, line.encode() + b"\r")
-        return self._answer(wait_s)
+        for _ in range(ATTEMPTS):
+            _write(self.device, line.encode() + b"\r")
+            answer = self._answer(wait_s)
+            if answer:
+                return answer
+        return ""
 
     def _answer(self, wait_s: float) -> str:
         until_s = time.monotonic() + wait_s
@@ -175,6 +181,16 @@ class ApiMode:
     def _ask(
         self, command: str, value: bytes, shown: int | None = None, wait_s: float = ANSWER_S
     ) -> xbee.AtResponse:
+        for _ in range(ATTEMPTS):
+            answer = self._ask_once(command, value, wait_s)
+            if answer is not None and answer.status != 0:
+                refused = _STATUS.get(answer.status, "refused")
+                raise DeviceError(_refused(command, shown, refused))
+            if answer is not None:
+                return answer
+        raise DeviceError(_refused(command, shown, ""))
+
+    def _ask_once(self, command: str, value: bytes, wait_s: float) -> xbee.AtResponse | None:
         self._frame_id = self._frame_id % 255 + 1
         request = xbee.AtCommand(self._frame_id, command.encode(), value)
         # A module in use also delivers what it hears: only the answer to this frame counts.
@@ -186,12 +202,8 @@ class ApiMode:
                 data = self.device.read(max(1, self.device.in_waiting))
             for frame in parser.feed(data):
                 if isinstance(frame, xbee.AtResponse) and frame.frame_id == self._frame_id:
-                    if frame.status != 0:
-                        raise DeviceError(
-                            _refused(command, shown, _STATUS.get(frame.status, "refused"))
-                        )
                     return frame
-        raise DeviceError(_refused(command, shown, ""))
+        return None
 
 
 def _write(device: serial.Serial, data: bytes) -> None:
