@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -23,6 +24,7 @@ from relpos.cli.main import app
 from relpos.errors import interrupts_kept
 from relpos.fusion import kernel_cache
 from relpos.live.session import Outcome
+from support.waiting import until
 
 TEAM: Any = SimpleNamespace(name="/dev/pts/9", is_now=True)
 
@@ -100,6 +102,54 @@ def test_ctrl_c_is_no_traceback_of_a_process_that_still_starts() -> None:
     process.kill()
     process.join()
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+
+
+def test_a_ctrl_c_within_a_callback_of_the_compiler_s_library_is_not_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    @ctypes.CFUNCTYPE(None)
+    def called_back() -> None:  # What is raised here is printed, and goes on as if nothing were.
+        signal.raise_signal(signal.SIGINT)
+
+    rehearsed: list[str] = []
+
+    def rehearse(room: str, _: int) -> None:
+        rehearsed.append(room)
+        called_back()
+
+    monkeypatch.setattr(kernel_cache, "is_complete", lambda rooms: True)
+    monkeypatch.setattr(fusion, "rehearse", rehearse)
+    with pytest.raises(KeyboardInterrupt):
+        fusion.warm_up("bank")
+    assert len(rehearsed) == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("number", "before"),
+    [
+        (signal.SIGINT, ""),
+        (signal.SIGTERM, ""),
+        (signal.SIGTERM, "trap '' INT; "),  # as in the background of a script
+    ],
+)
+def test_sigterm_ends_a_session_in_the_words_of_ctrl_c(
+    tmp_path: Path, number: signal.Signals, before: str
+) -> None:
+    folder = tmp_path / "mill"
+    command = [sys.executable, "-m", "relpos", "mission", str(folder), "loop://"]
+    options = ["--estimator", "deadreckoning", "--no-open", "--view-listen", "127.0.0.1:0"]
+    process = subprocess.Popen(
+        ["sh", "-c", f'{before}exec "$@"', "sh", *command, *options],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    log = folder / "journal.jsonl"
+    until(lambda: log.exists() and "no node is heard" in log.read_text(), "it does not begin")
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60.0)
+    assert "relpos: no motion was received: nothing can be estimated" in said
+    assert process.returncode == 1
 
 
 def test_ctrl_c_ends_the_processes_that_compile(

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from relpos.errors import RelposError, interrupts_kept
+from relpos.errors import RelposError, interrupts_deferred, interrupts_kept
 from relpos.fusion import kernel_cache, plugins
 from relpos.fusion.deadreckoning import DeadReckoning
 from relpos.fusion.estimator import (
@@ -177,7 +177,8 @@ def warm_up(name: str, progress: Progress | None = None) -> None:
             process.wait()
     for room in ROOMS.get(name, ()):
         if room not in SELDOM:
-            rehearse(room, _FEW_S)
+            with interrupts_deferred():
+                rehearse(room, _FEW_S)
 
 
 _ALL_S, _FEW_S = 25, 4
