@@ -294,6 +294,21 @@ def test_an_alarm_is_told_at_once_to_a_server_that_is_back(schedule: Schedule) -
     assert "test.3-9-1-1" in due(schedule, team_view(3, changes=still), 4.0)
 
 
+def test_what_a_session_has_sent_lapses_by_itself_and_is_repeated_before_it_does(
+    schedule: Schedule,
+) -> None:
+    still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
+    sent: dict[str, list[tuple[float, float]]] = {}
+    for second in range(200):
+        shown = team_view(second, changes={**GONE, 3: still})
+        for uid, event in due(schedule, shown, float(second)).items():
+            sent.setdefault(uid, []).append((float(second), event.stale_s - event.time_s))
+    for uid, lasts_s in (("test.2", 15.0), ("test.3-9-1-1", 600.0), ("test.1-last", 86_400.0)):
+        times = [at_s for at_s, _ in sent[uid]] + [200.0]
+        for at_s, after_s, (_, stale_s) in zip(times, times[1:], sent[uid], strict=False):
+            assert after_s - at_s < stale_s <= lasts_s, uid
+
+
 @pytest.mark.soak  # `make soak` installs it
 def test_takproto_reads_members_alarms_markers_and_deletions(schedule: Schedule) -> None:
     takproto = pytest.importorskip("takproto", reason="make soak installs it")
