@@ -178,6 +178,9 @@ def test_a_damaged_block_is_left_out_and_reported(tmp_path):
         (b"settings", b"\xff" * 8),
         (b"/serial", b"\xff" * 7),
         (b"/motion", b"/nation"),
+        # A channel's number: one that is nobody's, and the next one's.
+        (b"\6\0\6\0\7\0\0\0/status", b"\x77"),
+        (b"\2\0\2\0\7\0\0\0/motion", b"\3"),
     ],
 )
 def test_a_damaged_beginning_costs_nothing_behind_it_and_is_told(tmp_path, place, damage):

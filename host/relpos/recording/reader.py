@@ -33,6 +33,7 @@ from relpos.recording.output import parts_of
 from relpos.recording.schemas import all_topics
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, assemble
+from relpos.version import __version__
 
 _LATEST_S = BOUNDS["time_s"][1]
 
@@ -57,13 +58,16 @@ class _File:
     def supply_channels(self) -> None:
         """Take those of our files for channels whose own records are damaged."""
         ours = numbered(all_topics())
-        known = [(n, ours[c.topic]) for n, c in self.channels.items() if c.topic in ours]
-        if sum(n == number for n, number in known) < len(known) / 2:
+        known = {n: ours[c.topic] for n, c in self.channels.items() if c.topic in ours}
+        wrong = [n for n, number in known.items() if n != number]
+        if len(wrong) > len(known) / 2:
             return  # Another version's, which numbers them in another way.
-        for name, number in ours.items():
-            odd = self.channels.get(number)
-            if odd is None or odd.topic not in ours:
-                self.head_damaged |= odd is not None
+        odd = [n for n in range(1, max(known, default=1)) if n not in known]
+        self.head_damaged |= bool(wrong or odd)
+        if self.head_damaged:
+            for number in wrong:
+                del self.channels[number]
+            for name, number in ours.items():
                 self.channels[number] = Channel(number, name, "json", {}, number)
 
 
@@ -103,7 +107,8 @@ class Recording:
         if about is None and files[0].channels and not known & there:
             raise DataError(f"{path}: an MCAP file, but no recording of relpos: none of its topics")
         for file in files:
-            if about is not None or file.head_damaged:
+            # Another version may have other topics.
+            if file.head_damaged or (about is not None and about.version == __version__):
                 file.supply_channels()
         recording = cls(path, about, files)
         if about is None and files[0].head_damaged:
