@@ -22,10 +22,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from relpos import fusion
 from relpos.evaluation import study, vertical
 from relpos.evaluation.executors import executor
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
-from relpos.fusion.post import Reference
+from relpos.fusion.post import Referring
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Height
@@ -68,7 +69,7 @@ def heights_alone(condition: str, seed: int, seconds: float) -> vertical.Vertica
     """Score the vertical filter by itself: everybody is at the origin of the plane."""
     run = building.simulate_building(f"{building.PREFIX}-{condition}", seed, {"seconds": seconds})
     nodes = sorted({prior.node for prior in run.priors})
-    reference = Reference(frozenset(run.posts))
+    reference = Referring(fusion.make("deadreckoning", []), frozenset(run.posts))
     timeline, heights = Timeline(nodes), VerticalFilter(posts=reference.posts)
     estimates = []
     for slot in timeline.push_all(map(reference.refer, run.measurements), final=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -10,12 +11,13 @@ import relpos
 from relpos import fusion
 from relpos.cli.fuse import Job
 from relpos.errors import DataError
+from relpos.fusion.models.pressure import FAST_S, Weather
 from relpos.fusion.post import Referring, referring
 from relpos.measurements import Height, Motion, Prior
 from relpos.runs import NodeInfo
 from relpos.runs.description import Description, description_text, parse_description
 
-POST, WEARER = 7, 1
+POST, OTHER_POST, WEARER = 7, 8, 1
 
 
 def test_the_weather_that_a_post_shows_is_no_climb_of_anybody() -> None:
@@ -31,6 +33,18 @@ def test_the_weather_that_a_post_shows_is_no_climb_of_anybody() -> None:
         left_m.append(referred.height_m - climbed_m)
     assert max(map(abs, left_m)) < 0.4
     assert abs(left_m[-1]) < 0.2
+
+
+def test_a_second_post_that_begins_in_a_gust_makes_the_weather_no_worse() -> None:
+    weather, off_m = Weather(), []
+    for second in range(1200):
+        weather.measure(Height(float(second), POST, 0.0))
+        if second >= 300:
+            gust_m = 0.4 * math.exp((300 - second) / FAST_S)
+            weather.measure(Height(float(second), OTHER_POST, 2.0 + gust_m))
+        off_m.append(abs(weather.at(float(second))))
+    assert max(off_m) < 0.1
+    assert off_m[-1] < 0.05
 
 
 def test_a_post_stays_where_it_is_whatever_it_reports() -> None:
