@@ -46,6 +46,8 @@ def advance(state: Floats, covariance: Floats, node: Indices, moved: Floats) -> 
         c, s = math.cos(heading), math.sin(heading)
         turn_by = np.array([[c, -s], [s, c]])
         step = math.exp(state[i, 4]) * turn_by @ np.array([forward, left])
+        turned = covariance[at : at + 2, at + 2 : at + 4] @ drift / (heading_variance + 1e-12)
+        so_far = max(step @ np.array([turned[1], -turned[0]]), 0.0) / (step @ step + 1e-12)
         f = np.eye(PER_NODE)
         f[:2, 2] = shrunk * np.array([-step[1], step[0]])
         f[:2, 3] = -half_s * f[:2, 2]
@@ -54,10 +56,10 @@ def advance(state: Floats, covariance: Floats, node: Indices, moved: Floats) -> 
         covariance[here] = f @ covariance[here]
         covariance[:, here] = covariance[:, here] @ f.T
         own = turn_by @ np.diag([sigma_x**2, sigma_y**2]) @ turn_by.T
-        own += 0.5 * (1.0 - shrunk**2) ** 2 * np.outer(step, step)
+        own += (1.0 + 2.0 * so_far) * 0.5 * (1.0 - shrunk**2) ** 2 * np.outer(step, step)
         aside = np.array([-step[1], step[0]])
         swept = 0.5 * (1.0 - shrunk**4) - heading_variance * shrunk**2
-        own += max(swept, 0.0) * np.outer(aside, aside)
+        own += (1.0 + 2.0 * so_far) * max(swept, 0.0) * np.outer(aside, aside)
         covariance[at : at + 2, at : at + 2] += own
         state[i, :2] += shrunk * step
         state[i, 2] += turn - duration_s * state[i, 3]

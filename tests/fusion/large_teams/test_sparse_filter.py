@@ -62,7 +62,8 @@ def plain(
     """Ranges that are alike, and depend on no terms."""
     count = len(node)
     no_slopes, level = np.zeros((count, len(made.terms))), np.zeros(count)
-    return Ranges(node, peer, measured_m, level, np.ones(count), np.zeros((count, 3)), no_slopes)
+    known, outliers = np.zeros(count), np.zeros((count, 3))
+    return Ranges(node, peer, measured_m, level, np.ones(count), known, outliers, no_slopes)
 
 
 def random_moves(rng: np.random.Generator, count: int) -> Floats:
@@ -124,7 +125,7 @@ def test_terms_delays_and_clocks_are_those_of_a_dense_filter_with_them_as_states
         true = np.hypot(*(state[node, :2] - state[peer, :2]).T)
         measured = true + rng.normal(0.0, SIGMA_M, node.size) + slopes[:, TERMS + 6] * 0.3
         sure, none = np.ones(node.size), np.zeros((node.size, 3))
-        made.update(Ranges(node, peer, measured, none[:, 0], sure, none, slopes))
+        made.update(Ranges(node, peer, measured, none[:, 0], sure, none[:, 0], none, slopes))
         dense.update_with_terms(state, terms, joint, (node, peer), measured, slopes, SIGMA_M)
     own, carried = dense.given_terms(joint, 7)
     assert np.allclose(made.state, state, atol=1e-4)
@@ -157,7 +158,7 @@ def test_a_team_that_outgrows_delays_and_clocks_keeps_what_all_ranges_have_in_co
     ones, none = np.ones(node.size), np.zeros((node.size, 3))
     common = rng.normal(0.0, 1.0, (node.size, TERMS))
     slopes = made.slopes_in_terms(node, peer, common, rng.normal(0.0, 1.0, node.size))
-    made.update(Ranges(node, peer, measured, none[:, 0], ones, none, slopes))
+    made.update(Ranges(node, peer, measured, none[:, 0], ones, none[:, 0], none, slopes))
     terms, sigma = made.terms[:TERMS], made.sigma_of_terms()[:TERMS]
     made.own_sd = ()
     made.add(pose[5:].copy(), variance[None])
@@ -229,6 +230,29 @@ def test_the_way_under_a_vague_heading_is_as_uncertain_across_as_along_it() -> N
     assert made.state[:, 0] == pytest.approx(way_m * np.sqrt(kept), rel=1e-6)
     assert along_m2 == pytest.approx(0.5 * (way_m * (1.0 - kept)) ** 2, abs=1e-6)
     assert across_m2 == pytest.approx(0.5 * way_m**2 * (1.0 - kept**2), rel=1e-3)
+
+
+@pytest.mark.parametrize("known_m", [0.0, 1.0])
+def test_a_range_as_far_off_as_it_is_known_to_err_is_no_outlier(known_m: float) -> None:
+    made = NeighbourhoodFilter(math.inf, RangeModel(SIGMA_M, 0.05, 3.0))
+    made.add(np.array([[0.0, 0, 0], [5.0, 0, 0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)))
+    far = plain(made, np.array([0]), np.array([1]), np.array([6.5]))
+    inlier = made.update(far._replace(variance_m2=np.array([known_m**2])))
+    assert (inlier[0] > 0.8) == (known_m > 0.0)
+    assert np.hypot(*(made.pose[1, :2] - made.pose[0, :2])) == pytest.approx(5.0, abs=0.01)
+
+
+@pytest.mark.parametrize("steps_an_epoch", [1, 5])
+def test_steps_under_one_heading_are_no_surer_than_the_way_at_once(steps_an_epoch: int) -> None:
+    made, heading_rad, steps = NeighbourhoodFilter(math.inf), 0.35, 10
+    made.add(np.zeros((1, 3)), np.diag([0.0, 0.0, heading_rad**2])[None])
+    for _ in range(steps // steps_an_epoch):
+        made.predict(np.zeros(steps_an_epoch, int), np.tile([1.0, *6 * [0]], (steps_an_epoch, 1)))
+        along_m2, across_m2, *_ = made.marginals()[0]
+    kept = math.exp(-(heading_rad**2))
+    assert made.state[0, 0] == pytest.approx(steps * math.sqrt(kept), rel=1e-6)
+    assert math.sqrt(along_m2) == pytest.approx(math.sqrt(0.5) * steps * (1.0 - kept), rel=0.05)
+    assert math.sqrt(across_m2) == pytest.approx(math.sqrt(0.5 * (1.0 - kept**2)) * steps, rel=0.01)
 
 
 @pytest.mark.parametrize(

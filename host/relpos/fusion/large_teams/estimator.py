@@ -420,12 +420,11 @@ class LargeTeam:
         slant = np.sqrt(apart_m**2 + lift)
         measured = excess + slant
         before, prior = f.pose.copy(), f.marginals()
-        # A range of twice the variance counts half.
-        counts = self._correlation.repeats(pairs).sample_count / (1.0 + vague / f.model.sigma_m**2)
+        counts = self._correlation.repeats(pairs).sample_count
         spread_m2 *= (apart_m / np.maximum(slant, NEAREST_M)) ** 2
-        innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2)
+        innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2 + vague)
         outliers = self._outliers.expected(time_s, pairs)
-        inlier = f.update(Ranges(node, peer, measured, lift, counts, outliers, slopes))
+        inlier = f.update(Ranges(node, peer, measured, lift, counts, vague, outliers, slopes))
         self._correct_unseen(pairs, time_s, before[:, :2], prior)
         measured -= slopes @ f.terms
         slant = np.sqrt(f.antenna_pairs(node, peer)[0] ** 2 + lift)
@@ -457,6 +456,8 @@ class LargeTeam:
         """Learn the range sigma by online expectation maximisation.
 
         E |z - d|^2 after the ranges is the residual's square plus what is still uncertain of d.
+        What is known to add to it is not taken off: around long reports more errs than that (24
+        people, ranges .6 s late, gaps of 5 s: NEES 1.2, and 1.9 where it is).
         """
         model, square_m2 = self.filter.model, pairs[0] ** 2 + pairs[2] + lift
         square = (measured - np.sqrt(square_m2)) ** 2

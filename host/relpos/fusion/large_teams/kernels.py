@@ -50,7 +50,7 @@ def displacements(moves: Floats, variances: Floats) -> Floats:
 
 @compiled
 def move(
-    state: Floats, lever: Floats, noise: Floats, moments: Floats, node: Indices, moved: Floats
+    state: Floats, lever: Floats, noise: Floats, before: Floats, node: Indices, moved: Floats
 ) -> None:
     """Move nodes by pieces of reported displacements, one after the other.
 
@@ -59,12 +59,13 @@ def move(
     displacement (people turn, then move). What the covariance has to be changed by is collected
     per node: ``lever`` (N, 3, 3) is the derivative of the pose by heading, drift and scale of the
     last update (but for the heading's by itself), ``noise`` (N, 7) the covariance xx, xy, yy, xh,
-    yh, hh, and the scale's variance, added since. ``moments`` (N, 6) of the last update are xx, yy,
-    xy, the heading's variance, its covariance with the drift, and the drift's variance.
+    yh, hh, and the scale's variance, added since. ``before`` (N, 5, 5) are the nodes' own
+    covariances at the last update.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
     exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, across by d^2 (1 - exp(-2v)) / 2,
-    of which the derivative has d^2 v exp(-v): statistical linearisation, as in the bank.
+    of which the derivative has d^2 v exp(-v): statistical linearisation, as in the bank. Here it
+    errs alike on the way w so far that the heading turns: for d^2 stands (w + d)^2 - w^2.
     """
     for e in range(len(node)):
         i = node[e]
@@ -77,17 +78,20 @@ def move(
         c, s = math.cos(heading), math.sin(heading)
         # The turn's noise first: it turns this displacement, too.
         noise[i, 5] += moved[e, 5] * moved[e, 5]
-        gained = lever[i, 2, 1]
-        spread = moments[i, 3] + gained * (2.0 * moments[i, 4] + gained * moments[i, 5])
-        spread += noise[i, 5]
+        xh, yh, hh = noise[i, 3], noise[i, 4], noise[i, 5]
+        # Covariances of states before it with the heading, then those of pose and heading now.
+        old = before[i, :, 2] + lever[i, 2, 1] * before[i, :, 3]
+        spread = hh + old[2] + lever[i, 2, 1] * old[3]
+        x_now = xh + old[0] + (lever[i, 0] * old[2:]).sum()
+        y_now = yh + old[1] + (lever[i, 1] * old[2:]).sum()
         shrunk = math.exp(-0.5 * spread)
         dx, dy = c * forward - s * left, s * forward + c * left
         short2 = shrunk * shrunk
-        along = 0.5 * (1.0 - short2) ** 2
-        swept = max(0.5 - 0.5 * short2 * short2 - spread * short2, 0.0)
+        so_far = max(dx * y_now - dy * x_now, 0.0) / (spread * (dx * dx + dy * dy) + 1e-12)
+        along = (1.0 + 2.0 * so_far) * 0.5 * (1.0 - short2) ** 2
+        swept = (1.0 + 2.0 * so_far) * max(0.5 - 0.5 * short2 * short2 - spread * short2, 0.0)
         # Derivative of the displacement by the heading.
         hx, hy = -shrunk * dy, shrunk * dx
-        xh, yh, hh = noise[i, 3], noise[i, 4], noise[i, 5]
         sx, sy = moved[e, 3] * moved[e, 3], moved[e, 4] * moved[e, 4]
         noise[i, 0] += 2.0 * hx * xh + hx * hx * hh
         noise[i, 0] += c * c * sx + s * s * sy + along * dx * dx + swept * dy * dy
@@ -197,6 +201,8 @@ class Ranges(NamedTuple):
     """Mean squares of the differences of height."""
     counts: Floats
     """How many independent ranges each is worth."""
+    variance_m2: Floats
+    """What is known to add to the variance of each."""
     outliers: Floats
     """(E, 3): probability that it is an outlier, at least; the part of it that repeats the pair's
     last one, and by how much that was too long (m)."""
@@ -245,9 +251,9 @@ def range_information(
         innovation = ranges.measured_m[e] - middle
         outliers, again = max(model.outliers, ranges.outliers[e, 0]), ranges.outliers[e, 1]
         curved = 0.5 * (across * across + tilted * tilted) / square
-        noise = model.sigma_m * model.sigma_m + curved
+        noise = model.sigma_m * model.sigma_m + ranges.variance_m2[e]
         slope = distance / middle
-        expected = slope * slope * along + noise
+        expected = slope * slope * along + noise + curved
         wide = expected + model.outlier_m * model.outlier_m
         side = 2.0 * (1.0 - OUTLIERS_SHORT if innovation > 0.0 else OUTLIERS_SHORT)
         usual = (1.0 - outliers) * math.exp(-0.5 * (innovation * innovation / expected))
@@ -261,7 +267,7 @@ def range_information(
         inlier[e] = usual / (usual + odd + 1e-300)
         if inlier[e] < 1e-3 or abs(strip[i] - strip[j]) > 1:
             continue
-        weight = inlier[e] / (model.sigma_m * model.sigma_m / ranges.counts[e] + curved)
+        weight = inlier[e] / (noise / ranges.counts[e] + curved)
         ux, uy = slope * math.cos(bearing), slope * math.sin(bearing)
         line = lines[e]
         line[0], line[1], line[2], line[3] = weight, ux, uy, innovation

@@ -119,9 +119,8 @@ class NeighbourhoodFilter:
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
     _noise: Floats = field(default_factory=lambda: np.empty((0, len(kernels.ENTRIES))))
-    _moments: Floats = field(default_factory=lambda: np.empty((0, 6)))
-    """At the last update: variances of x and y, their covariance, the heading's variance, its
-    covariance with the drift, and the drift's variance (N, 6)."""
+    _moments: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, COVARIANCE)))
+    """Each node's own covariance (N, 5, 5) at the last update."""
     _behind: bool = False
     _axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0]))
     _origin_m: float = 0.0
@@ -370,7 +369,7 @@ class NeighbourhoodFilter:
     def marginals(self) -> Floats:
         """Return the variances xx, yy, the covariance xy, and the heading's variance: (N, 4)."""
         self._catch_up()
-        return self._moments[:, :4]
+        return self._moments[:, [0, 1, 0, 2], [0, 1, 1, 2]]
 
     def common_marginals(self) -> Floats:
         """Return what the common motion adds to :meth:`marginals` (N, 4)."""
@@ -379,12 +378,11 @@ class NeighbourhoodFilter:
         return added[:, [0, 1, 0, 2], [0, 1, 1, 2]]
 
     def _own_moments(self) -> Floats:
-        result = np.empty((len(self.state), 6))
+        result = np.empty((len(self.state), COVARIANCE, COVARIANCE))
         for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
             n = len(block) // COVARIANCE
-            x, y, h, d = (block[a : a + n, a:].diagonal() for a in range(0, 4 * n, n))
-            xy, hd = block[:n, n:].diagonal(), block[2 * n : 3 * n, 3 * n :].diagonal()
-            result[self._layout.nodes_of(k)] = np.column_stack((x, y, xy, h, hd, d))
+            each = block.reshape((n, COVARIANCE, n, COVARIANCE), order="F")
+            result[self._layout.nodes_of(k)] = np.moveaxis(each.diagonal(axis1=0, axis2=2), 2, 0)
         return result
 
     def inflate(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:
