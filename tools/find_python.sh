@@ -4,7 +4,9 @@
 set -u
 
 seen=
-for name in ${RELPOS_PYTHON:-python3 python3.13 python3.12 python3.11 python3.14}; do
+[ -n "${RELPOS_PYTHON:-}" ] && set -- "$RELPOS_PYTHON" ||
+    set -- python3 python3.13 python3.12 python3.11 python3.14
+for name in "$@"; do
     version=$("$name" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) || continue
     case $version in
         3.[0-9] | 3.10 | 2.*)

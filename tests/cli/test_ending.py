@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import io
 import multiprocessing
 import os
 import signal
@@ -24,6 +25,7 @@ from relpos.cli.main import app
 from relpos.errors import interrupts_kept
 from relpos.fusion import kernel_cache
 from relpos.live.session import Outcome
+from relpos.nodes.boards import BOARDS
 from support.waiting import until
 
 TEAM: Any = SimpleNamespace(name="/dev/pts/9", is_now=True)
@@ -198,3 +200,19 @@ def test_a_link_to_itself_is_one_line(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert len(result.stderr.splitlines()) == 1
     assert "loop" in result.stderr
+
+
+def test_ctrl_c_while_a_board_is_flashed_says_what_the_board_is_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("relpos.link.port.open_port", lambda *_: io.BytesIO())
+    monkeypatch.setattr("relpos.nodes.boards.check", lambda *_: BOARDS["uno"])
+    monkeypatch.setattr("relpos.nodes.upload.upload", interrupted)
+    result = CliRunner().invoke(app, ["node", "flash", "/dev/ttyACM0"])
+    assert result.exit_code == 1
+    assert result.stderr.splitlines()[-1] == (
+        "relpos: /dev/ttyACM0: interrupted: the board may hold half of the firmware; flash it again"
+    )

@@ -215,3 +215,28 @@ def test_recordings_that_are_missing_are_named_before_any_is_played(
     (run / "imu.csv").write_text(IMU)
     said = refusal("simulate", "--recordings", *folders, "--seed", 1, "--out", "team")
     assert said == "nowhere: no such folder\n"
+
+
+def test_a_key_that_is_none_is_refused_before_there_is_a_mission(tmp_path: Path) -> None:
+    (tmp_path / "plan.png").write_bytes(b"\x89PNG")
+    words = ("mission", tmp_path / "m", "--key-file", tmp_path / "plan.png", "--seconds", 1)
+    assert "no key can be read" in refusal(*words)
+    assert not (tmp_path / "m").exists()
+
+
+def test_a_new_key_that_has_no_folder_is_refused_before_a_board_is_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("relpos.link.port.open_port", lambda *_: pytest.fail("the board's port"))
+    key = tmp_path / "stick" / "team.key"
+    said = refusal("node", "flash", "/dev/ttyACM0", "--new", "--key-file", key)
+    assert said == f"{key}: cannot be written: there is no folder {key.parent}\n"
+
+
+def test_a_recording_under_another_name_is_told(run: Path) -> None:
+    done = relpos("fuse", run, *QUICK, "--record", "tracks.csv", "--out", "out")
+    assert done.exit_code == 0, done.output
+    assert "tracks.csv: an MCAP recording, whatever its name says\n" in done.stderr
+    again = relpos("fuse", "tracks.csv", *QUICK, "--record", "b.MCAP", "--out", "again")
+    assert again.exit_code == 0, again.output
+    assert "whatever" not in again.stderr

@@ -156,9 +156,12 @@ def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):
     assert "NUMBA_CACHE_DIR" in remedy
 
 
-def test_kernels_that_a_read_only_home_refuses_are_wrong(tmp_path):
-    (tmp_path / "home").touch()  # no folder can be made in it, not even by root
-    program = (
+@pytest.mark.parametrize("disk", ["read-only", "full"])
+def test_kernels_that_a_home_refuses_are_wrong(tmp_path, disk):
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+    if disk == "read-only":
+        (tmp_path / "home").touch()  # no folder can be made in it, not even by root
+    program = (full if disk == "full" else "") + (
         "from pathlib import Path\nfrom relpos.doctor import computer, installation\n"
         "print(*installation.look(computer.Computer(), None, Path('.')), sep='\\n')\n"
     )

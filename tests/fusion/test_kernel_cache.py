@@ -1,6 +1,8 @@
 """Where compiled kernels are kept: a folder for each state of their sources."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,6 +58,7 @@ def test_every_import_of_a_kernel_s_file_is_found() -> None:
 def test_without_a_writable_cache_a_session_and_its_processes_share_a_temporary_one(
     fusion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(kernel_cache, "refused", [])
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "kernels"))
     folder = kernel_cache.folder_here(fusion / "room")
@@ -63,3 +66,25 @@ def test_without_a_writable_cache_a_session_and_its_processes_share_a_temporary_
     assert folder.parent == Path(os.environ["NUMBA_CACHE_DIR"])
     kernel_cache.mark_complete("room")
     assert kernel_cache.is_complete(["room"])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_full_disk_is_asked_for_no_new_kernels_and_keeps_those_it_has(
+    tmp_path: Path, compiled: bool
+) -> None:
+    for room in ("bank", "models"):
+        folder = kernel_cache.folder(kernel_cache.FUSION / room, tmp_path)
+        folder.mkdir()
+        if compiled:
+            (folder / "kernel.nbc").touch()
+    program = (
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "from relpos.fusion import kernel_cache\n"
+        "print(kernel_cache.folder_here(kernel_cache.FUSION / 'bank'))\n"
+    )
+    used = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    assert Path(used).is_relative_to(tmp_path) == compiled

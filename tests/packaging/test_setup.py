@@ -77,3 +77,12 @@ def test_a_setup_that_was_killed_before_pip_was_there_is_begun_again(checkout):
     pip = [checkout / ".venv" / "bin" / "pip", "--version"]
     done = subprocess.run(pip, capture_output=True, text=True, check=True)
     assert f" {checkout}/.venv/lib/" in done.stdout
+
+
+def test_a_python_whose_path_has_spaces_is_found(tmp_path):
+    python = tmp_path / "a python of mine"
+    python.symlink_to(sys.executable)
+    command = [ROOT / "tools" / "find_python.sh"]
+    chosen = os.environ | {"RELPOS_PYTHON": str(python)}
+    found = subprocess.run(command, env=chosen, capture_output=True, text=True, check=False)
+    assert (found.stdout, found.stderr) == (f"{python}\n", "")

@@ -1,6 +1,8 @@
 """Messages: each has a golden frame, fits one, and counters wrap."""
 
 import json
+import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -9,9 +11,8 @@ from hypothesis import strategies as st
 
 from relpos.protocol import messages as wire
 
-VECTORS = json.loads(
-    (Path(__file__).parents[2] / "protocol" / "vectors" / "frames.json").read_text()
-)
+ROOT = Path(__file__).parents[2]
+VECTORS = json.loads((ROOT / "protocol" / "vectors" / "frames.json").read_text())
 
 
 def test_every_frame_fits_the_66_bytes_that_all_radio_modules_carry():
@@ -39,3 +40,11 @@ def test_differences_survive_the_wrap_of_every_counter(data):
     assert field.difference(newer_value, older_value) == pytest.approx(
         ahead / field.per_unit, abs=0.01 / field.per_unit
     )
+
+
+def test_a_commit_of_any_generated_file_checks_them_all():
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    (files,) = re.findall(r"id: wire\n(?:.*\n)*?\s+files: (.*)", hooks)
+    outputs = runpy.run_path(str(ROOT / "protocol" / "generate.py"))["outputs"]()
+    for path in outputs:
+        assert re.search(files, path.relative_to(ROOT).as_posix()), path

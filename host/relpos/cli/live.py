@@ -162,6 +162,8 @@ class Options:
             recording.check(self.record)
         if self.record is not None:
             output.check_file(self.record)
+            if not self.record.name.lower().endswith(recording.SUFFIX):
+                output.remark(f"{self.record}: an MCAP recording, whatever its name says")
 
 
 def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:

@@ -16,7 +16,7 @@ import typer
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, EstimatorName
 from relpos.cli.fuse import Initial, Job, fuse_live, replay_run
-from relpos.cli.keys import KeyFile, make_link
+from relpos.cli.keys import KeyFile, make_link, team_key
 
 if TYPE_CHECKING:
     from relpos.cli.waiting import Choice
@@ -77,6 +77,7 @@ def mission(
     if invite is not None:
         _print_invitation(Mission.open(folder), invite, view_listen)
         return
+    team_key(key_file)
     known = (folder / ABOUT).exists()
     found = Mission.open(folder, source if known else source or "", name)
     found.about.post = post or found.about.post

@@ -75,6 +75,10 @@ def flash(
         raise typer.BadParameter("say where: --key-file FILE", param_hint="--new")
     if new and key_file is not None and key_file.exists():
         raise DataError(f"{key_file} exists already: a key is not overwritten")
+    if new and key_file is not None:
+        if not key_file.parent.is_dir():
+            raise DataError(f"{key_file}: cannot be written: there is no folder {key_file.parent}")
+        output.check_folder(key_file.parent)
     team_key(None if new else key_file), team_key(old_key_file)  # before anything is written
     found = port or boards.find_port()
     with closing(open_port(found, boards.BOOT_BAUD)) as device:
@@ -83,8 +87,13 @@ def flash(
     typer.echo(f"{found}: Arduino {kind.name} ({kind.chip})")
     if warning is not None:
         typer.echo(f"{found}: {warning}", err=True)
-    with output.working("building and writing the firmware"):
-        size = upload.upload(kind, found, imu=str(imu))
+    try:
+        with output.working("building and writing the firmware"):
+            size = upload.upload(kind, found, imu=str(imu))
+    except KeyboardInterrupt:
+        raise DeviceError(
+            f"{found}: interrupted: the board may hold half of the firmware; flash it again"
+        ) from None
     typer.echo("firmware written and verified" + (f" ({size} bytes)" if size else ""))
     if new and key_file is not None:
         write_new_key(key_file)

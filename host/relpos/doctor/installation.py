@@ -70,7 +70,7 @@ def _kernels(computer: Computer) -> Finding:
     folder = kernel_cache.root(computer.environment("NUMBA_CACHE_DIR"))
     if kernel_cache.refused:
         folder = kernel_cache.refused[0]
-    if not computer.may_write(folder):
+    if kernel_cache.refused or not computer.may_write(folder):
         return wrong(
             name,
             f"compiled code cannot be stored in {folder}: every start compiles again",

@@ -20,6 +20,8 @@ from pathlib import Path
 import platformdirs
 
 FUSION = Path(__file__).parent
+ROOM_BYTES = 8 << 20
+"""More than the kernels of a room take on the disk."""
 _COMPLETE = "complete"
 """This file stands in a room's folder once its kernels have been compiled."""
 refused: list[Path] = []
@@ -71,19 +73,24 @@ _IMPORT = re.compile(r"^ *from (relpos\.fusion[\w.]*) import (\([^)]*\)|[^\n(]+)
 def folder_here(room: Path) -> Path:
     """Return the room's folder for this process and those that it starts; it can be written.
 
-    Where the user's cache cannot be written, kernels are kept until the process ends.
+    Where the user's cache cannot be written, or its disk is full, kernels are kept until the
+    process ends.
     """
     kept = folder(room, root(os.environ.get("NUMBA_CACHE_DIR")))
     try:
         kept.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=kept):
+        wanted = 0 if any(kept.iterdir()) else ROOM_BYTES
+        with tempfile.TemporaryFile(dir=kept) as file:
+            file.write(bytes(wanted))
             return kept
     except OSError:
         refused.append(kept.parent)
         temporary = tempfile.mkdtemp(prefix="relpos-")
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         os.environ["NUMBA_CACHE_DIR"] = temporary
-        return folder_here(room)
+        kept = folder(room, Path(temporary))
+        kept.mkdir()
+        return kept
 
 
 def is_complete(rooms: Iterable[str], under: Path | None = None) -> bool:
