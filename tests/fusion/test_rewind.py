@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -240,3 +241,24 @@ def test_the_bank_ends_with_late_data_as_it_does_with_sorted(share: float) -> No
         rewinds = bank.counters().get("rewinds", 0)
     assert final[1] == final[0]
     assert rewinds > 0
+
+
+@pytest.mark.parametrize("estimator", ["bank", "particle"])
+def test_copies_go_without_the_garbage_collector_as_soon_as_they_are_too_old(
+    estimator: str,
+) -> None:
+    run = simulate_paper("paper", seed=3, overrides={"seconds": 40, "nodes": 3})
+    filter_ = fusion.make(estimator, run.priors, seed=0)
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        for m in run.measurements:
+            filter_.process(m)
+        gc.collect()
+        left = {type(thing) for thing in gc.garbage}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not [kind for kind in left if kind.__module__.startswith("relpos")]

@@ -47,6 +47,11 @@ class HypothesisSet(HypothesisArrays):
         """Covariance of the rigid motion of the whole team that has been taken out."""
         self.spread_components()
 
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Make it a copy, to which its biases belong."""
+        self.__dict__.update(state)
+        self.biases.belong_to(self)
+
     # -- the common rotation -------------------------------------------------------------------
 
     def take_out_common_rotation(self) -> tuple[Floats, Floats]:

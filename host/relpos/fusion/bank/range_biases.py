@@ -9,6 +9,7 @@ its difference, of a user its height.
 from __future__ import annotations
 
 import math
+import weakref
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ class RangeBiases:
 
     def __init__(self, hypotheses: HypothesisArrays) -> None:
         """Begin with what all ranges have in common."""
-        self._hypotheses = hypotheses
+        self.belong_to(hypotheses)
         self.pairs: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its bias in the state."""
         self.users: dict[int, int] = {}
@@ -79,6 +80,16 @@ class RangeBiases:
         self._climbed_s: float | None = None
         self._ranges: dict[tuple[int, int], tuple[int, float, float]] = {}
         """Pair of rows -> how many ranges, their mean (m) and variance (m^2)."""
+
+    def belong_to(self, hypotheses: HypothesisArrays) -> None:
+        """Refer to the set, which refers to this: its copies, as large as it, go at once so."""
+        self._set = weakref.ref(hypotheses)
+
+    @property
+    def _hypotheses(self) -> HypothesisArrays:
+        these = self._set()
+        assert these is not None
+        return these
 
     def move_back(self, by: int) -> None:
         """Note that all entries are stored so many later."""
