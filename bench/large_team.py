@@ -73,7 +73,7 @@ class Strips:
             np.zeros((count, 3)),
             np.zeros((count, terms)),
         )
-        self.filter.update(Ranges(node, peer, measured, level, same, no_outliers, no_slopes))
+        self.filter.update(Ranges(node, peer, measured, level, same, level, no_outliers, no_slopes))
 
     def pose(self) -> Floats:
         """Poses."""

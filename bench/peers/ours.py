@@ -120,7 +120,9 @@ class Strips:
             np.zeros((count, terms)),
         )
         self.filter.update(
-            Ranges(ranges.node, ranges.peer, ranges.range_m, level, same, no_outliers, no_slopes)
+            Ranges(
+                ranges.node, ranges.peer, ranges.range_m, level, same, level, no_outliers, no_slopes
+            )
         )
 
     def positions(self) -> Floats:
