@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -157,6 +158,7 @@ def test_sigterm_ends_a_session_in_the_words_of_ctrl_c(
 def test_ctrl_c_ends_the_processes_that_compile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    resource_tracker.ensure_running()  # it has to be a true Python's
     compiler, ledger = tmp_path / "python", tmp_path / "started"
     ledger.touch()
     compiler.write_text(f"#!/bin/sh\necho $$ >> {ledger}\nexec sleep 60\n")
