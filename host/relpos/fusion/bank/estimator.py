@@ -422,7 +422,7 @@ class Bank:
     ) -> list[Attempts]:
         """Return the attempts of each round that ends here; the detection curve learns them."""
         rounds = []
-        ended = self.detection.rounds.add(time_s, ranges, timeline.reported_s, self._on_one_floor)
+        ended = self.detection.rounds.add(time_s, ranges, timeline.reported_s, self._telling)
         for done in ended:
             pairs = done.received + done.missed
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
@@ -438,8 +438,11 @@ class Bank:
             rounds.append(Attempts(*rows, received, attempted))
         return rounds
 
-    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> Bools:
-        return on_one_floor(*heights_apart(self._known, pairs))
+    def _telling(self, pairs: Sequence[tuple[int, int]]) -> Bools:
+        """Return of which pairs an attempt says something of the plane that the last has not."""
+        moved = self.range_correlation.moved_on(pairs)
+        telling: Bools = moved & on_one_floor(*heights_apart(self._known, pairs))
+        return telling
 
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement

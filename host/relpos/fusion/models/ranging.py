@@ -18,7 +18,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from relpos.fusion.arrays import Floats, Indices
+from relpos.fusion.arrays import Bools, Floats, Indices
 
 
 class CommonIndex(IntEnum):
@@ -258,6 +258,9 @@ class Repeats(NamedTuple):
     """What share is left of a bias that passes as users walk, within [0, 1]."""
 
 
+MOVED_M = 0.3
+"""Path of two after which an attempt to range is another one: what blocks it stands as they do."""
+
 LASTING_FROM, LASTING_COST = 0.02, 30.0
 """Share of the innovations' variance that errors have which last and are not modelled, above which
 ranges count less, and by how much: 1 / (1 + cost * excess).
@@ -282,6 +285,7 @@ class RangeCorrelation:
 
     _path_m: dict[int, float] = field(default_factory=dict)
     _last_m: dict[tuple[int, int], float] = field(default_factory=dict)
+    _moved_m: dict[tuple[int, int], float] = field(default_factory=dict)
     _mean: dict[tuple[int, int], float] = field(default_factory=dict)
     _product: float = 0.0
     _square: float = LASTING_RANGES
@@ -304,6 +308,16 @@ class RangeCorrelation:
         rho = STILL * np.exp(-path_m / DECORRELATION_M)
         count = np.minimum((1.0 - rho) / (1.0 + rho), 1.0 / (1.0 + LASTING_COST * lasting))
         return Repeats(count, np.exp(-path_m / PASSING_M))
+
+    def moved_on(self, pairs: Iterable[tuple[int, int]]) -> Bools:
+        """Return which pairs have moved since they were last found to have; all at first."""
+        moved = []
+        for pair in pairs:
+            now = self._path_m.get(pair[0], 0.0) + self._path_m.get(pair[1], 0.0)
+            moved.append(now >= self._moved_m.get(pair, -math.inf) + MOVED_M)
+            if moved[-1]:
+                self._moved_m[pair] = now
+        return np.array(moved, dtype=np.bool_)
 
     def learn(self, pairs: Iterable[tuple[int, int]], innovation: Floats, inlier: Floats) -> None:
         """Learn from innovations over their deviations, and inlier probabilities (R,)."""
