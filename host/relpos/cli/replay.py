@@ -67,9 +67,10 @@ class Played:
         from relpos import recording
         from relpos.live.board import Board, BoardError
         from relpos.live.mission import Mission
-        from relpos.recording.player import Call  # needs a library, which is looked for first
 
         recording.check(None)
+        from relpos.recording.player import Call  # needs what was just looked for
+
         board = Board()
         if not source.is_dir():
             return cls([source], source.stem, [], board.to_message())
