@@ -439,9 +439,9 @@ class Bank:
         return rounds
 
     def _telling(self, pairs: Sequence[tuple[int, int]]) -> Bools:
-        """Return of which pairs an attempt says something of the plane that the last has not."""
-        moved = self.range_correlation.moved_on(pairs)
-        telling: Bools = moved & on_one_floor(*heights_apart(self._known, pairs))
+        """Return of which pairs an attempt says something new of the plane."""
+        new = self.range_correlation.tells(pairs)
+        telling: Bools = new & on_one_floor(*heights_apart(self._known, pairs))
         return telling
 
     def _sense(self, step: Sensed) -> None:
