@@ -157,12 +157,12 @@ class ApiMode:
 
     def answers(self) -> bool:
         """Whether there is a module that speaks so; learns whether it escapes."""
-        try:
-            # Neither the question (as frame 1) nor the answer holds a byte that would be escaped.
-            self._frame_id = 0
-            self.escaped = self.get("AP") == 2
-        except DeviceError:
+        # Neither the question (as frame 1) nor the answer holds a byte that would be escaped.
+        self._frame_id = 0
+        answer = self._ask_once("AP", b"")  # Once: most speeds have nobody.
+        if answer is None or answer.status != 0:
             return False
+        self.escaped = int.from_bytes(answer.value, "big") == 2
         return True
 
     def get(self, command: str) -> int:
@@ -190,7 +190,9 @@ class ApiMode:
                 return answer
         raise DeviceError(_refused(command, shown, ""))
 
-    def _ask_once(self, command: str, value: bytes, wait_s: float) -> xbee.AtResponse | None:
+    def _ask_once(
+        self, command: str, value: bytes, wait_s: float = ANSWER_S
+    ) -> xbee.AtResponse | None:
         self._frame_id = self._frame_id % 255 + 1
         request = xbee.AtCommand(self._frame_id, command.encode(), value)
         # A module in use also delivers what it hears: only the answer to this frame counts.
