@@ -73,9 +73,9 @@ def flash(
 
     if new and key_file is None:
         raise typer.BadParameter("say where: --key-file FILE", param_hint="--new")
-    if new and key_file is not None and key_file.exists():
-        raise DataError(f"{key_file} exists already: a key is not overwritten")
     if new and key_file is not None:
+        if key_file.exists():
+            raise DataError(f"{key_file} exists already: a key is not overwritten")
         if not key_file.parent.is_dir():
             raise DataError(f"{key_file}: cannot be written: there is no folder {key_file.parent}")
         output.check_folder(key_file.parent)

@@ -15,9 +15,9 @@ from relpos.cli import live, output
 from relpos.errors import DataError
 
 if TYPE_CHECKING:
+    from relpos.live.alarms import Mayday
     from relpos.live.team_view import LogEntry
     from relpos.recording.moments import Moments
-    from relpos.recording.player import Call
 
 
 def replay(
@@ -59,24 +59,23 @@ class Played:
     entries: list[LogEntry]
     board: dict[str, Any]
     live_port: int | None = None
-    calls: tuple[tuple[float, Call], ...] = ()
+    calls: tuple[tuple[float, Mayday], ...] = ()
 
     @classmethod
     def open(cls, source: Path) -> Played:
         """Read what there is; DataError."""
         from relpos import recording
+        from relpos.live.alarms import Mayday
         from relpos.live.board import Board, BoardError
         from relpos.live.mission import Mission
 
         recording.check(None)
-        from relpos.recording.player import Call  # needs what was just looked for
-
         board = Board()
         if not source.is_dir():
             return cls([source], source.stem, [], board.to_message())
         mission = Mission.open(source)
         entries: list[LogEntry] = []
-        calls: list[tuple[float, Call]] = []
+        calls: list[tuple[float, Mayday]] = []
         for event in mission.events():
             if event["kind"] == "log":
                 entries.append(event["entry"])
@@ -84,7 +83,7 @@ class Played:
                 with contextlib.suppress(BoardError):
                     board.apply(event)
             elif event["kind"] == "mayday" and {"node", "time_s"} <= event.keys():
-                calls.append((event["time_s"], Call(event["node"], bool(event.get("on")))))
+                calls.append((event["time_s"], Mayday(event["node"], bool(event.get("on")))))
         paths = mission.recordings()
         if not paths:
             raise DataError(f"{source}: nothing is recorded yet")

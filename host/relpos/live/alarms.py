@@ -112,6 +112,14 @@ def moved(motion: Motion, duration_s: float = 1.0) -> bool:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Mayday:
+    """Somebody calls MAYDAY, or it is over: as a mission's journal has it."""
+
+    node: int
+    on: bool
+
+
 class Alarms:
     """Every wearer's condition; motions carry their own time, ``tick`` gets the session's."""
 

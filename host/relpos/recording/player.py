@@ -14,13 +14,13 @@ import time
 from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import itemgetter
 from typing import Any
 
 from relpos.fusion.estimator import NodeStatus
 from relpos.fusion.post import posts_of
-from relpos.live.alarms import RAISED, Alarms
+from relpos.live.alarms import RAISED, Alarms, Mayday
 from relpos.live.composer import STALE_S, ghosts_of
 from relpos.live.requests import AT_LANDMARK, RECORDED, Request, RequestSource
 from relpos.live.sinks import Sink
@@ -47,14 +47,6 @@ SWITCH_S = 0.001
 """Python's thread switch interval, as in a live session."""
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 TICK_KINDS = ("alarm", "landmark", "rollcall", "mayday", "evacuate", "note", "warning")
-
-
-@dataclass(frozen=True)
-class Call:
-    """A MAYDAY of a mission's journal, or its end."""
-
-    node: int
-    on: bool
 
 
 class History:
@@ -84,7 +76,7 @@ class History:
         names: dict[int, str],
         known: Sequence[LogEntry],
         posts: frozenset[int] = frozenset(),
-        calls: Sequence[tuple[float, Call]] = (),
+        calls: Sequence[tuple[float, Mayday]] = (),
     ) -> None:
         """Read everything once; ``known`` is a mission's log, else the alerts make one.
 
@@ -110,7 +102,7 @@ class History:
                     words = AT_LANDMARK.filled(name=name(row.node), landmark=row.value)
                     note(time_s, "landmark", words, row.node)
                 continue
-            if isinstance(row, Call):
+            if isinstance(row, Mayday):
                 (alarms.mayday.add if row.on else alarms.mayday.discard)(row.node)
             else:
                 self.heard_s.setdefault(row.node, array("d")).append(time_s)
@@ -119,7 +111,7 @@ class History:
                 alarms.add_motion(row)
             elif isinstance(row, Height):
                 alarms.add_height(row)
-            if time_s < ticked_s + TICK_S and not isinstance(row, Call):
+            if time_s < ticked_s + TICK_S and not isinstance(row, Mayday):
                 continue
             ticked_s = time_s
             alarms.tick(time_s, listening=True)
@@ -147,7 +139,7 @@ class Player:
         log: Iterable[LogEntry] = (),
         smoothed: Callable[[], Tracks | None] | None = None,
         admit: Callable[[dict[str, Any]], None] | None = None,
-        calls: Sequence[tuple[float, Call]] = (),
+        calls: Sequence[tuple[float, Mayday]] = (),
     ) -> None:
         self.ended = False
         self._admit = admit
@@ -167,7 +159,7 @@ class Player:
         )
         self._reader.start()
 
-    def _read(self, log: list[LogEntry], calls: Sequence[tuple[float, Call]]) -> None:
+    def _read(self, log: list[LogEntry], calls: Sequence[tuple[float, Mayday]]) -> None:
         # The thread has files of its own: two positions in one would meet.
         self.history.read(self.moments.again(), self.names, log, self.posts, calls)
 

@@ -36,6 +36,7 @@ from relpos.runs.run import Run, assemble
 from relpos.version import __version__
 
 _LATEST_S = BOUNDS["time_s"][1]
+MAKE_WHOLE = "`relpos convert FILE --to mcap --out NEW` writes anew what is behind it"
 
 
 @dataclass
@@ -394,6 +395,3 @@ def parsed(path: Path, kind: Any, payload: bytes) -> Any:
         return parse(kind, payload)
     except ValueError as error:
         raise DataError(f"{path}: damaged: {error}; {MAKE_WHOLE}") from None
-
-
-MAKE_WHOLE = "`relpos convert FILE --to mcap --out NEW` writes anew what is behind it"

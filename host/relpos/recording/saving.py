@@ -66,14 +66,14 @@ def _write_run(
 
 def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
     lost, newest = 0, -1
-    is_new = source.files[0].head_damaged and source.about is not None
-    if is_new and source.about is not None:
-        out.write(container.beginning(source.about.metadata(), all_topics()))
+    about = source.about if source.files[0].head_damaged else None
+    if about is not None:
+        out.write(container.beginning(about.metadata(), all_topics()))
     else:
         out.write(container.MAGIC)
     for file in source.files:
         with file.path.open("rb") as stream:
-            is_first = file is source.files[0] and not is_new
+            is_first = file is source.files[0] and about is None
             unread, newest = container.copy_blocks(stream, out, newest, beginning=is_first)
             lost += unread
     there = {channel.topic: number for number, channel in source.files[0].channels.items()}

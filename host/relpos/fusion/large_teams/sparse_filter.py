@@ -119,7 +119,7 @@ class NeighbourhoodFilter:
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
     _noise: Floats = field(default_factory=lambda: np.empty((0, len(kernels.ENTRIES))))
-    _moments: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, COVARIANCE)))
+    _before: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, COVARIANCE)))
     """Each node's own covariance (N, 5, 5) at the last update."""
     _behind: bool = False
     _axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0]))
@@ -210,7 +210,7 @@ class NeighbourhoodFilter:
             diagonal[k][:] = whole[np.ix_(at, at)]
             if k + 1 < len(states):
                 following[k][:] = whole[np.ix_(at, states[k + 1])]
-        self._moments = self._own_moments()
+        self._before = self._own_covariances()
 
     def _dense(self, reach: int | None = None) -> Floats:
         """Return the whole covariance (5N, 5N), node by node: far blocks by the chain.
@@ -239,7 +239,7 @@ class NeighbourhoodFilter:
 
         Forward, left, turn, then the three standard deviations, then how long the node moved.
         """
-        kernels.move(self.state, self._lever, self._noise, self._moments, node, moved)
+        kernels.move(self.state, self._lever, self._noise, self._before, node, moved)
         self._behind = True
 
     def _catch_up(self) -> None:
@@ -249,7 +249,7 @@ class NeighbourhoodFilter:
             self._carried[:, axis] += self._lever[:, axis, by, None] * self._carried[:, 2 + by]
         kernels.propagate(self._covariance, self._layout, self._lever, self._noise)
         self._behind = False
-        self._moments = self._own_moments()
+        self._before = self._own_covariances()
 
     # -- ranges --------------------------------------------------------------------------------
 
@@ -298,7 +298,7 @@ class NeighbourhoodFilter:
         step = np.linalg.solve(self.terms_information, told[:, 0])
         self.terms = self.terms + step
         self.state += self._carried @ step
-        self._moments = self._own_moments()
+        self._before = self._own_covariances()
         pull = np.zeros((len(self.state), 2))
         pulls = (weight * whitened[:, 0])[:, None] * lines[:, 1:3]
         np.subtract.at(pull, node, pulls)
@@ -344,7 +344,7 @@ class NeighbourhoodFilter:
         for block, own, other in blocks:
             block -= own @ s @ other.T
         self.common += about_origin(s, *middle)
-        self._moments = self._own_moments()
+        self._before = self._own_covariances()
 
     def pairs(self, node: Indices, peer: Indices) -> Floats:
         """Return distance, variances along and across it, and bearing of pairs (E,): (4, E)."""
@@ -369,7 +369,7 @@ class NeighbourhoodFilter:
     def marginals(self) -> Floats:
         """Return the variances xx, yy, the covariance xy, and the heading's variance: (N, 4)."""
         self._catch_up()
-        return self._moments[:, [0, 1, 0, 2], [0, 1, 1, 2]]
+        return self._before[:, [0, 1, 0, 2], [0, 1, 1, 2]]
 
     def common_marginals(self) -> Floats:
         """Return what the common motion adds to :meth:`marginals` (N, 4)."""
@@ -377,7 +377,7 @@ class NeighbourhoodFilter:
         added: Floats = g @ self.common @ g.swapaxes(1, 2)
         return added[:, [0, 1, 0, 2], [0, 1, 1, 2]]
 
-    def _own_moments(self) -> Floats:
+    def _own_covariances(self) -> Floats:
         result = np.empty((len(self.state), COVARIANCE, COVARIANCE))
         for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
             n = len(block) // COVARIANCE

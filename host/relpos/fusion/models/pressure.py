@@ -21,7 +21,6 @@ FAST_M, FAST_S = 0.2, 90.0
 NOISE_M = 0.06
 """Of a reported height (docs/building.md)."""
 
-
 UNKNOWN_M = 1e3
 """Of a node's offset, before it has reported a height."""
 

@@ -76,6 +76,26 @@ export class Alarms {
     if (alarm) this.active.set(node, { ...alarm, acknowledged, by });
   }
 
+  /**
+   * Acknowledge here at once, and with `send(node)`; `show()` follows each change. Those of whom
+   * nobody else learned are open again, and the error of `send` is thrown.
+   */
+  async acknowledgeAll(nodes, by, send, show) {
+    for (const node of nodes) this.acknowledge(node, by);
+    show();
+    const unsent = new Set(nodes);
+    try {
+      for (const node of nodes) {
+        await send(node);
+        unsent.delete(node);
+      }
+    } catch (error) {
+      for (const node of unsent) this.acknowledge(node, "", false);
+      show();
+      throw error;
+    }
+  }
+
   /** The worst first: unacknowledged before acknowledged, by priority, then the oldest. */
   list() {
     const rank = (a) => (a.acknowledged || a.shelvedS ? 3 : 0) + RANK[a.level];

@@ -274,20 +274,10 @@ function showAge() {
 
 async function acknowledge(nodes) {
   const by = me?.name ?? t("phone.some");
-  for (const node of nodes) alarms.acknowledge(node, by);
-  sound();
-  banner.update(alarms);
-  const unsent = new Set(nodes);
+  const show = () => { sound(); banner.update(alarms); };
   try {
-    for (const node of nodes) {
-      await postJson("/api/acknowledge", { node, by });
-      unsent.delete(node);
-    }
+    await alarms.acknowledgeAll(nodes, by, (node) => postJson("/api/acknowledge", { node, by }), show);
   } catch (error) {
-    // Nobody else knows of it: it is open again.
-    for (const node of unsent) alarms.acknowledge(node, "", false);
-    sound();
-    banner.update(alarms);
     say(t("acknowledge.failed", { error: error.message }));
   }
 }

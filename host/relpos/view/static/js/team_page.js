@@ -338,23 +338,13 @@ function stopFinding() {
 }
 
 async function acknowledge(nodes) {
-  for (const node of nodes) alarms.acknowledge(node, by());
-  sound();
-  banner.update(alarms);
-  map.invalidate();
+  const send = (node) => postJson("/api/acknowledge", { node, by: by() });
+  const acknowledged = alarms.acknowledgeAll(nodes, by(), send, () => { sound(); banner.update(alarms); map.invalidate(); });
   // The button is gone: on to the next alarm's, or back to the map.
   (byId("alarms").querySelector(".rows .buttons button:last-child") ?? byId("map")).focus();
-  const unsent = new Set(nodes);
   try {
-    for (const node of nodes) {
-      await postJson("/api/acknowledge", { node, by: by() });
-      unsent.delete(node);
-    }
+    await acknowledged;
   } catch (error) {
-    // Nobody else knows of it: it is open again.
-    for (const node of unsent) alarms.acknowledge(node, "", false);
-    sound();
-    banner.update(alarms);
     say(t("acknowledge.failed", { error: error.message }));
   }
 }
