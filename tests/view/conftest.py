@@ -8,7 +8,16 @@ from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import expect
-from stage import NO_BROWSER, Browser, Page, Stage, browser_of, chromium, sync_playwright
+from stage import (
+    NO_BROWSER,
+    Browser,
+    Page,
+    Stage,
+    browser_of,
+    chromium,
+    sync_playwright,
+    wait_ready,
+)
 from walking_team import WalkingTeam
 
 # Generous: other tests run beside these.
@@ -81,6 +90,7 @@ def visit(browser: Browser, stage: Stage) -> Iterator[OpenPage]:
         page.on("request", request)
         page.on("websocket", lambda socket: request(socket) if here not in socket.url else None)
         page.goto(stage.url(path))
+        wait_ready(page)
         return page
 
     yield visit

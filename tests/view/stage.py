@@ -209,6 +209,14 @@ def wait_for(condition: Callable[[], bool], within_s: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+def wait_ready(page: Page) -> None:
+    """Wait until a page that has been opened listens to its buttons.
+
+    It does so once its texts are there, which can be after the browser calls it loaded.
+    """
+    expect(page.locator("#language option")).not_to_have_count(0)
+
+
 def wait_live(page: Page) -> None:
     """Wait until the page shows that its connection is there."""
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")
@@ -229,4 +237,5 @@ __all__ = [
     "until_held",
     "wait_for",
     "wait_live",
+    "wait_ready",
 ]
