@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -38,6 +40,10 @@ def as_climbed(
     of: dict[int, list[Decided]] = {}
     for one in vertical.decided or ():
         of.setdefault(one.node, []).append(one)
+    heights = {
+        node: (np.array([d.end_s for d in own]), np.array([d.z_m for d in own]))
+        for node, own in of.items()
+    }
     before: dict[int, float] = {}
     changed: list[Measurement] = []
     for m in sorted(measurements, key=lambda m: m.time_s):
@@ -47,8 +53,7 @@ def as_climbed(
             changed.append(replace(m, dx_m=share * m.dx_m, dy_m=share * m.dy_m))
             before[m.node] = m.time_s
         elif isinstance(m, Height) and own:
-            z_m = float(np.interp(m.time_s, [d.end_s for d in own], [d.z_m for d in own]))
-            changed.append(replace(m, height_m=z_m))
+            changed.append(replace(m, height_m=float(np.interp(m.time_s, *heights[m.node]))))
         else:
             changed.append(m)
     return changed
@@ -58,8 +63,10 @@ def _share(own: Sequence[Decided], begin_s: float, end_s: float) -> float:
     """Return the true share of a displacement between two times."""
     begin_s = max(begin_s, end_s - 10.0)
     less = 0.0
-    for one in own:
+    # They follow each other in time.
+    for one in own[bisect_right(own, begin_s, key=attrgetter("end_s")) :]:
         overlap_s = min(end_s, one.end_s) - max(begin_s, one.begin_s)
-        if overlap_s > 0.0:
-            less += overlap_s * (1.0 - one.share)
+        if overlap_s <= 0.0:
+            break
+        less += overlap_s * (1.0 - one.share)
     return 1.0 - less / max(end_s - begin_s, 1e-9)
