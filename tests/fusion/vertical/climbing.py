@@ -87,11 +87,12 @@ def follow(
     begins_s: Mapping[int, float] | None = None,
     silent: Mapping[int, tuple[float, float]] | None = None,
     stuck_s: Mapping[int, float] | None = None,
+    away_s: tuple[float, float] = (math.inf, math.inf),
     with_steps: bool = True,
 ) -> Outcome:
     """Let a team live; the shorter lives end standing. Heights come to the centimetre.
 
-    From ``stuck_s`` on a node repeats its last height.
+    From ``stuck_s`` on a node repeats its last height; during ``away_s`` nobody is heard at all.
     """
     rng = np.random.default_rng(seed)
     vertical = VerticalFilter()
@@ -121,14 +122,15 @@ def follow(
             start_s = (begins_s or {}).get(node, 0.0)
             from_s, to_s = (silent or {}).get(node, (math.inf, math.inf))
             noise = noise_m * rng.standard_normal()
-            if time_s > start_s and not from_s <= time_s < to_s:
+            away = away_s[0] <= time_s < away_s[1]
+            if time_s > start_s and not away and not from_s <= time_s < to_s:
                 h = now[node] - late_m + pressure[node] + bias[node] + noise + weather_m_s * time_s
                 if start_s:
                     h -= z[node][int(start_s)] + weather_m_s * start_s
                 if time_s < (stuck_s or {}).get(node, math.inf):
                     shown[node] = round(h, 2)
                 vertical.measure(Height(time_s, node, shown[node]), time_s)
-        for back in vertical.close(time_s):
+        for back in () if away else vertical.close(time_s):
             claimed[back.node] += complex(back.dx_m, back.dy_m)
         for node in lives:
             told[node].append(vertical.of(node, time_s))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from climbing import FALL, FAN_ON, Outcome, Part, blown, follow, lift, stairs, stand, walk
 
 from relpos.fusion.estimator import Episode, Vertical
-from relpos.measurements import Range
+from relpos.fusion.timeline import Advance
+from relpos.fusion.vertical.filter import VerticalFilter
+from relpos.measurements import Height, Range
 
 BESIDE = [walk(110)]
 """Somebody else, who stays on the level."""
@@ -192,6 +195,39 @@ def test_nobody_reporting_for_a_while_is_no_error() -> None:
     gap = (20.0, 40.0)
     outcome = follow({1: [walk(60)], 2: [walk(60)]}, silent={1: gap, 2: gap})
     assert abs(_error_m(outcome)[-1]) < 0.5
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("minutes", [2, 15])
+def test_a_team_that_nobody_heard_for_minutes_is_somewhere_and_doubts_it(minutes: int) -> None:
+    back_s = 60 * minutes + 50
+    climbs = [walk(60), stairs(7.0), walk(back_s)]
+    outcome = follow({1: climbs, 2: [walk(back_s)], 3: [walk(back_s)]}, away_s=(50.0, back_s))
+    for node in (1, 2, 3):
+        error_m = np.abs(_error_m(outcome, node)[back_s:])
+        sigma_m = np.array([v.sigma_z_m for v in outcome.told[node][back_s:]])
+        assert np.isfinite(error_m).all()
+        # Until it is decided what happened, nobody is sure to be where they were.
+        assert sigma_m[:3].min() > 1.0
+        assert error_m[10:40].max() < 1.2
+    soon = [v.floor_probability or 0.0 for v in outcome.told[1][back_s : back_s + 4]]
+    assert max(soon) < 0.9
+    assert outcome.told[1][back_s + 20].floor == 2
+    assert {v.episode for v in outcome.told[2][back_s:]} == {Episode.LEVEL}
+
+
+def test_who_shows_no_height_takes_no_memory() -> None:
+    vertical = VerticalFilter(posts=frozenset({7}))
+    sizes = []
+    for tenth in range(1, 2001):
+        time_s = 0.1 * tenth
+        for node in (1, 2, 7):
+            vertical.move(Advance(time_s, node, 0.1, 0.13, 0.0, 0.0, steps=0.18))
+        if tenth < 20:
+            vertical.measure(Height(time_s, 1, 0.01 * tenth), time_s)
+        vertical.close(time_s)
+        sizes.append(len(pickle.dumps(vertical)))
+    assert sizes[-1] < 1.5 * sizes[200]
 
 
 def test_what_was_climbed_without_pressure_is_known_once_it_is_back() -> None:

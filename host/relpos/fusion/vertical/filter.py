@@ -296,21 +296,25 @@ class VerticalFilter:
         if again.any():
             # How it came there nobody has seen.
             self._beliefs = episodes.begin_again(self._beliefs, again, height, variance)
+        # What the air did while nobody reported nobody has seen, either.
+        duration_s = time_s - begin_s if time_s - begin_s <= UNSEEN_S else 1.0
         reported = Interval(
-            time_s - begin_s, np.where(again | ~news, 1.0, since_s), steps,
+            duration_s, np.where(again | ~news, 1.0, since_s), steps,
             np.where(news, height, np.nan), variance, self._walked,
         )  # fmt: skip
         before = self._height_means()
         update = episodes.update(self._beliefs, reported)
         self._beliefs = update.beliefs
-        unseen_s = time_s - np.array([max(track.height_s, begin_s) for track in tracks])
-        absent = np.array([time_s - track.height_s > UNSEEN_S for track in tracks])
+        before_s = np.where(news, taken_s[1] - np.maximum(taken_s[0], begin_s), 0.0)
+        unseen_s = time_s - np.maximum(taken_s[1], begin_s)
+        absent = time_s - taken_s[1] > UNSEEN_S
+        silent_s = np.where(absent, unseen_s, np.where(before_s > UNSEEN_S, before_s, 0.0))
         self._open.append(
             _Interval(
                 begin_s, time_s, taken_s, reported, update, self._height_means() - before,
                 np.array([one.way_m for one in moved]),
                 np.array([one.displacement_m for one in moved]),
-                np.where(absent, unseen_s, 0.0), again, np.array([one.made_m for one in moved]),
+                silent_s, again, np.array([one.made_m for one in moved]),
             )
         )  # fmt: skip
         self._walked = np.where(news, steps > STANDS_STEPS, self._walked)
@@ -472,13 +476,15 @@ class VerticalFilter:
         k = int(np.argmax(told))
         where, steps = self.floors.probability[row], self._level_steps[row]
         level = [float(one.happened.level[row]) for one in self._open]
-        stays = self._settled[row] and all(p >= 0.5 for p in level)
+        vague = unseen_m2 >= VAGUE_M**2
+        stays = self._settled[row] and not vague and min(level, default=1.0) >= 0.5
         if not stays:
             for one, p in zip(self._open, level, strict=True):
                 steps = steps * p + one.reported.steps[row]
             own_m2 = self.heights.covariance[row, Z, Z] + unseen_m2 + doubt_m**2
             climbed_m = self.heights.mean[row, Z] + risen_m
-            over = Over(self._over.mean_m[row] + risen_m, self._over.variance_m2[row])
+            over_m2 = self._over.variance_m2[row] + vague * unseen_m2
+            over = Over(self._over.mean_m[row] + risen_m, over_m2)
             where = self.floors.where(self._base[row], climbed_m, own_m2, steps, over)
         floor, certain = most_probable(where)
         if stays:

@@ -121,7 +121,8 @@ def _chain(rates_hz: Mapping[tuple[int, int], float], count: int, dt_s: float) -
     leaves = rates.sum(axis=1)
     share = np.where(leaves > 0.0, (1.0 - np.exp(-leaves * dt_s)) / leaves, 0.0)
     matrix: Floats = rates * share[:, None]
-    np.fill_diagonal(matrix, 1.0 - matrix.sum(axis=1))
+    # After minutes nobody stays, and rounding would make it less than nothing.
+    np.fill_diagonal(matrix, np.maximum(1.0 - matrix.sum(axis=1), 0.0))
     return matrix
 
 

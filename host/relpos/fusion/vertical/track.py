@@ -97,6 +97,9 @@ class Track:
         share = self.expected
         self._reached = Moved(x + steps, y + way_m, reported + moved, made + share * moved)
         self._points.append((step.time_s, self._reached))
+        if self.height_s <= self.taken_s:
+            # The next height is newer: without one (a dead sensor) nothing may pile up.
+            self._forget(step.time_s - HEIGHT_LATE_S)
         self.heading *= cmath.rect(1.0, step.dtheta_rad)
         if share == 1.0:
             return step
@@ -105,8 +108,7 @@ class Track:
     def take(self) -> Moved:
         """Return the motion up to the newest height."""
         until_s, points = self.height_s - HEIGHT_LATE_S, self._points
-        while len(points) > 1 and points[1][0] <= until_s:
-            points.popleft()
+        self._forget(until_s)
         total = self._taken
         if points and points[0][0] <= until_s:
             (begin_s, total), *rest = points
@@ -117,3 +119,9 @@ class Track:
         since = self._taken.to(total)
         self._taken, self.taken_s = total, self.height_s
         return since
+
+    def _forget(self, until_s: float) -> None:
+        """Drop the pieces that end before, but for the last one's end."""
+        points = self._points
+        while len(points) > 1 and points[1][0] <= until_s:
+            points.popleft()
