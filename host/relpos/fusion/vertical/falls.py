@@ -13,7 +13,7 @@ import numpy as np
 
 from relpos.fusion.arrays import Floats
 from relpos.fusion.vertical import episodes
-from relpos.fusion.vertical.episodes import Beliefs, Interval, Update
+from relpos.fusion.vertical.episodes import STANDS_STEPS_S, Beliefs, Interval, Update
 from relpos.fusion.vertical.heights import UNSEEN_S
 from relpos.fusion.vertical.modes import Mode
 from relpos.measurements import Height
@@ -21,8 +21,13 @@ from relpos.measurements import Height
 LEAST_FALL_M = 0.9
 """A fall is told from here on. Emulated falls of 1.7 m (seeds 100 to 111) show at least 1.1 m, and
 0.9 m by 1.1 s after their end; a door of 10 Pa is 0.8 m."""
-INTERVALS = 5
-SHORTEST_S = 0.2
+LEAST_DROP_M = 2.5
+"""So much at once is no door's pressure (:data:`~relpos.fusion.vertical.filter.LOST_M`) but a free
+fall: 3 m take 0.8 s."""
+INTERVALS, FREE_INTERVALS = 5, 2
+SHORTEST_S = 0.75
+"""Nodes may report ten times a second (``report-period``); five intervals have to hold a fall, and
+the modes are those of about a second."""
 
 
 @dataclass(slots=True)
@@ -62,12 +67,16 @@ class FallDetector:
         update = episodes.update(self._beliefs, interval)
         self._beliefs, self._walked = update.beliefs, steps > 0.0
         self._recent.append((update, rise_m))
-        fell = episodes.smooth([one for one, _ in self._recent])
-        fallen_m = -sum(
-            float(modes[0, 0, Mode.FALLING]) * rise
-            for modes, (_, rise) in zip(fell, self._recent, strict=True)
-        )
-        if fallen_m < LEAST_FALL_M:
+        did = np.array([modes[0, 0] for modes in episodes.smooth([one for one, _ in self._recent])])
+        rises_m = np.array([rise for _, rise in self._recent])
+        fallen_m = -float(did[:, Mode.FALLING] @ rises_m)
+        # A free fall looks like a door's pressure. It is over at once, which no lift's ride is.
+        falling = rises_m < -LEAST_FALL_M / INTERVALS
+        at_once = 0 < falling.sum() <= FREE_INTERVALS and not (falling[0] or falling[-1])
+        dropped_m = 0.0
+        if at_once and steps <= STANDS_STEPS_S * since_s:
+            dropped_m = -float(did[:, [Mode.FALLING, Mode.JUMP]].sum(axis=1) @ rises_m)
+        if fallen_m < LEAST_FALL_M and dropped_m < LEAST_DROP_M:
             return False
         self._begin(height_m, variance_m2)
         return True
