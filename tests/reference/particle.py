@@ -124,7 +124,9 @@ def dual_step(
         ring_of, radial, phase, angle, source_of = uniforms[k, :-1].reshape(DUAL_DRAWS, fresh)
         edge = first + (ring_of * seen).astype(np.int64)
         normal = np.sqrt(-2.0 * np.log1p(-radial)) * np.cos(2.0 * math.pi * phase)
-        radius = range_m[edge] + noise.sigma_r_m * normal
+        slant = range_m[edge] + noise.sigma_r_m * normal
+        radius = np.sqrt(np.maximum(slant**2 - height_m[edge] ** 2, 0.0))
+        radius = np.where(height_m[edge] == 0.0, slant, radius)
         ring = np.stack([np.cos(2.0 * math.pi * angle), np.sin(2.0 * math.pi * angle)])
         points = centres[:, peer[edge]] + radius * ring
         log_weight = log_density(points, poses[:2, k], predicted[k])

@@ -157,6 +157,18 @@ def test_the_dual_particles_mass_is_alpha_and_they_lie_on_the_ring() -> None:
         assert ring == pytest.approx(29.0, abs=0.6)
 
 
+def test_the_ring_of_somebody_a_floor_above_is_as_wide_as_the_slant_range_leaves() -> None:
+    rng = np.random.default_rng(4)
+    poses = rng.normal(0.0, 2.0, (3, 1, 1000))
+    predicted = np.full((1, 1000), 1e-3)
+    ranges = ranges_of([(0, 3.0, 0.0, 5.0)], 1)._replace(height_m=np.array([-4.0]))
+    before = poses.copy()
+    dual_step(rng, poses, predicted, predicted.copy(), ranges, 0.01, 0.1)
+    fresh = (poses != before).any(axis=0)[0]
+    ring_m = np.hypot(poses[0, 0, fresh] - 3.0, poses[1, 0, fresh])
+    assert ring_m == pytest.approx(3.0, abs=0.1)
+
+
 def test_dual_particles_weigh_by_predicted_density_and_the_other_ranges() -> None:
     rng = np.random.default_rng(5)
     # On the ring of 10 m about the origin the particles are at (10, 0) and the second range says

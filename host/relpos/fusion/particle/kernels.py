@@ -367,6 +367,9 @@ def dual_step(
             c, _ = vectormath.cos_sin_turns(draws[2 * fresh + d])
             normal = c * math.sqrt(-2.0 * vectormath.log(1.0 - draws[fresh + d]))
             radius = range_m[e] + sigma_m * normal
+            if height_m[e] != 0.0:
+                # The range is a slant one.
+                radius = math.sqrt(max(radius * radius - height_m[e] ** 2, 0.0))
             c, s = vectormath.cos_sin_turns(draws[3 * fresh + d])
             px[d] = centres[0, peer[e]] + radius * c
             py[d] = centres[1, peer[e]] + radius * s
