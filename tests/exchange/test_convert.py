@@ -463,6 +463,19 @@ def test_geojson_is_what_the_rfc_asks_for(tmp_path: Path) -> None:
     assert features(path, kind="region", node=2)[0]["geometry"]["type"] == "Polygon"
 
 
+def test_a_height_of_no_stated_deviation_is_not_exact_in_geojson(tmp_path: Path) -> None:
+    made = [
+        replace(one, nodes=tuple(replace(node, sigma_z_m=0.0) for node in one.nodes))
+        for one in estimates()
+    ]
+    write_estimates(tmp_path / "fused", made)
+    path = tmp_path / "map.geojson"
+    convert(tmp_path / "fused", "--pin", PIN, "--to", "geojson", "--out", path)
+    (last,) = features(path, kind="position", node=2)
+    assert last["properties"]["height_m"] == 1.0
+    assert last["properties"]["sigma_height_m"] is None
+
+
 def test_the_region_holds_nineteen_of_twenty(tmp_path: Path) -> None:
     _, fused = written(tmp_path)
     path = tmp_path / "map.geojson"

@@ -93,7 +93,7 @@ class Received:
 def due(schedule: Schedule, shown: TeamView, now_s: float) -> dict[str, Received]:
     from relpos.live.cot_events import serialized
 
-    events = [Received(serialized(e)) for e in schedule.due(shown, FRAME, now_s, {1: 0.5})]
+    events = [Received(serialized(e)) for e in schedule.due(shown, FRAME, now_s, {1: 0.5, 3: 0.0})]
     assert len({event.uid for event in events}) == len(events)
     return {event.uid: event for event in events}
 
@@ -120,6 +120,7 @@ def test_a_member_is_a_friendly_unit_where_it_is(schedule: Schedule) -> None:
         assert math.remainder(course - expected, 360.0) == pytest.approx(0.0, abs=0.06)
     assert events["test.1"].le == pytest.approx(1.645 * 0.5, abs=0.06)
     assert events["test.2"].le == UNKNOWN
+    assert events["test.3"].le == UNKNOWN, "a standard deviation of 0 is one that is not stated"
 
 
 def test_the_command_posts_node_is_no_unit(schedule: Schedule) -> None:

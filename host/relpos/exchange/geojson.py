@@ -93,7 +93,9 @@ def _vertical(n: NodeEstimate) -> dict[str, float | int | None]:
     """Return height over the start and floor, where the estimator knows of them."""
     found: dict[str, float | int | None] = {}
     if n.z_m or n.sigma_z_m:
-        found |= {"height_m": _rounded(n.z_m), "sigma_height_m": _rounded(n.sigma_z_m)}
+        # Where none is stated it is 0, which is not exact.
+        sigma_m = n.sigma_z_m or math.nan
+        found |= {"height_m": _rounded(n.z_m), "sigma_height_m": _rounded(sigma_m)}
     return found if n.floor is None else found | {"floor": n.floor}
 
 

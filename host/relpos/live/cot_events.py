@@ -258,7 +258,7 @@ def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Eleme
         else f"{max(circle_90_m(person.sigma_major_m, person.sigma_minor_m), 0.1):.1f}",
         "hae": None if height_m is None else f"{height_m:.1f}",
         "le": None
-        if height_m is None or sigma_z_m is None or not math.isfinite(sigma_z_m)
+        if height_m is None or not sigma_z_m or not math.isfinite(sigma_z_m)
         else f"{max(_NORMAL_90 * sigma_z_m, 0.1):.1f}",
     }
     there: ET.Element = pytak.cot_point(
