@@ -172,6 +172,12 @@ def test_one_who_falls_loses_height_in_two_seconds_without_a_step_and_lies() -> 
     assert sum(m.steps for m in after if m.node == 2) == 0
 
 
+@pytest.mark.parametrize("fall_s", [20.0, 80.0, 140.0, 200.0, 240.0, 260.0])
+def test_whoever_is_to_fall_falls_also_after_the_last_change_of_floors(fall_s: float) -> None:
+    ((begin_s, _),) = during(made("fall", fall_s=fall_s), 2, "falling")
+    assert fall_s < begin_s < fall_s + 90.0
+
+
 def test_two_teams_stay_one_above_the_other() -> None:
     run = made("teams")
     last = {t.node: t.z_m for t in run.truth}

@@ -258,7 +258,9 @@ class Climber:
                 self.ride(change.target)
             elif change.target != self.floor:
                 self.take_stairs(self.building.stairwells[change.well], change.target)
-        self._wander(math.inf)
+        self._wander(fall_s)
+        if not self.over:
+            self.fall()
         return self.track()
 
     def _wander(self, until_s: float) -> None:
