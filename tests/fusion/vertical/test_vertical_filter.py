@@ -157,6 +157,23 @@ def test_who_joins_late_is_anywhere() -> None:
     assert outcome.told[1][-1].sigma_z_m < 0.5
 
 
+def test_a_team_that_comes_long_after_its_post_starts_on_the_floor_of_the_start() -> None:
+    vertical = VerticalFilter(posts=frozenset({7}))
+    for second in range(400):
+        time_s = float(second)
+        vertical.measure(Height(time_s, 7, 0.0), time_s)
+        for node in (1, 2):
+            if second >= 300:
+                vertical.move(Advance(time_s, node, 1.0, 1.3, 0.0, 0.0, steps=1.8))
+                vertical.measure(Height(time_s, node, 0.02 * (second % 3)), time_s)
+        vertical.close(time_s)
+    for node in (1, 2, 7):
+        told = vertical.of(node, 399.0)
+        assert told.floor == 0
+        assert (told.floor_probability or 0.0) > 0.9
+        assert told.sigma_z_m < 0.5
+
+
 def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
     outcome = follow({1: [walk(30), stairs(3.5), walk(100)], 2: [walk(200)]}, begins_s={2: 100.0})
     vertical = outcome.filter

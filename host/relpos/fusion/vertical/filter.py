@@ -51,7 +51,7 @@ LAG_S = 6.0
 """What happened so long ago is decided."""
 
 LATE_S = 60.0
-"""Who reports a first height so long after the first of all joins late."""
+"""Who reports a first height so long after the first wearer joins late."""
 
 LEAST_CORRECTION_M = 0.05
 """One outlier of the pressure claims 0.02 m on level ground."""
@@ -168,6 +168,8 @@ class VerticalFilter:
     floors: Floors = field(default_factory=Floors)
     first_s: float = math.inf
     """When the first height was reported."""
+    _worn_s: float = math.inf
+    """When a wearer's was."""
     decided: list[Decided] | None = None
     """Everything decided, where somebody wants it."""
     _row: dict[int, int] = field(default_factory=dict)
@@ -212,7 +214,9 @@ class VerticalFilter:
         if unseen_s > 0.0:
             self.heights.doubt(self._row[node], UNSEEN_M * math.sqrt(unseen_s))
         elif node not in self._row:
-            self._add(node, track, late=time_s > self.first_s + LATE_S)
+            # A post is often on long before.
+            self._worn_s = min(self._worn_s, time_s)
+            self._add(node, track, late=time_s > self._worn_s + LATE_S)
         return track.height_s == time_s
 
     def _track(self, node: int) -> Track:
