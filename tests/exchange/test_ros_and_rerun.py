@@ -8,12 +8,15 @@ from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
+from relpos.exchange.content import Content
+from relpos.exchange.rrd import write_rrd
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Range
-from relpos.runs import load_run, read_estimates, save_run
+from relpos.runs import Run, load_run, read_estimates, save_run
 from support.small_team import convert, refused, run, written
 
 START = "2026-05-04T09:30:00Z"
@@ -129,6 +132,15 @@ def test_a_failed_range_is_infinite_in_a_bag_as_rep_117_has_it(tmp_path: Path) -
         }
     assert told["/relpos/node_2/range_to_3"] == math.inf
     assert math.isfinite(told["/relpos/node_1/range_to_2"])
+
+
+def test_a_failed_range_is_a_gap_in_rerun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = MagicMock()  # The library itself needs 600 MB.
+    monkeypatch.setitem(sys.modules, "rerun", library)
+    measured = (Range(2.5, 2, 3, 0.0), Range(3.5, 2, 3, 4.0))
+    write_rrd(tmp_path / "team.rrd", Content(Run("yard", measurements=measured)))
+    (told,) = library.Scalars.columns.call_args_list
+    assert told.kwargs["scalars"] == pytest.approx([math.nan, 4.0], nan_ok=True)
 
 
 @pytest.mark.soak  # it needs 600 MB, which `make soak` installs

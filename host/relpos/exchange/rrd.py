@@ -67,7 +67,9 @@ class _Writer:
                     self._recording.log(entity, way, static=True)
         rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for r in self._content.run.ranges:
-            rows[f"range/{r.node}_{r.peer}"].append((r.time_s, r.range_m))
+            # A failed one is no distance: a gap in the plot.
+            range_m = r.range_m if r.range_m > 0.0 else math.nan
+            rows[f"range/{r.node}_{r.peer}"].append((r.time_s, range_m))
         for estimate in self._content.estimates:
             for pair in estimate.pairs:
                 rows[f"distance/{pair.node}_{pair.peer}"].append((estimate.time_s, pair.distance_m))
