@@ -178,6 +178,15 @@ def test_whoever_is_to_fall_falls_also_after_the_last_change_of_floors(fall_s: f
     assert fall_s < begin_s < fall_s + 90.0
 
 
+@pytest.mark.parametrize("fault", ["lost_s", "reboot_s", "carried_s"])
+def test_steps_go_with_the_way_that_they_make_up(fault: str) -> None:
+    run = made("calm", seconds=120.0, **{fault: 20.0})
+    own = [m for m in run.measurements if isinstance(m, Motion) and m.node == 2]
+    (after, *_) = (m for m in own if m.time_s >= 80.0)
+    assert after.steps <= 4, "nobody makes twenty seconds' steps in one"
+    assert all(m.steps == 0 for m in own if 60.0 <= m.time_s < 80.0)
+
+
 def test_two_teams_stay_one_above_the_other() -> None:
     run = made("teams")
     last = {t.node: t.z_m for t in run.truth}

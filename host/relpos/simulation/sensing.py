@@ -142,7 +142,7 @@ def motions(settings: SensingSettings, truth: Walk, rng: np.random.Generator) ->
         begins_s = np.r_[0.0, time_s]
         poses = truth.at(node, begins_s, claimed=True)
         total = truth.steps_at(node, begins_s)
-        taken = None if total is None else np.diff(total).astype(int).tolist()
+        taken = None if total is None else np.diff(total).astype(int)
         move, turn = np.diff(poses[:, :2], axis=0), np.diff(poses[:, 2])
         c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
         forward, left = c * move[:, 0] + s * move[:, 1], c * move[:, 1] - s * move[:, 0]
@@ -161,13 +161,13 @@ def motions(settings: SensingSettings, truth: Walk, rng: np.random.Generator) ->
         if node == DISTURBED:
             # Who is carried takes no steps, and turns.
             walks = (time_s < middle_s) | (time_s >= middle_s + settings.carried_s)
-            x, y = x * walks, y * walks
+            x, y, taken = x * walks, y * walks, None if taken is None else taken * walks
         outage_s = max(settings.lost_s, settings.reboot_s) if node == DISTURBED else 0.0
         pending, pending_turn, pending_steps = 0j, 0.0, 0
         for k, (t, dx, dy, angle) in enumerate(zip(time_s, x, y, turned, strict=True)):
-            pending_steps += 0 if taken is None else taken[k]
             if middle_s <= t < middle_s + outage_s:
                 continue
+            pending_steps += 0 if taken is None else int(taken[k])
             step = pending + complex(dx, dy) * cmath.rect(1.0, pending_turn)
             angle += pending_turn
             if t > gap_phase_s and (t - gap_phase_s) % 60.0 < settings.gap_s:
