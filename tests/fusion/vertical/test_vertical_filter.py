@@ -174,6 +174,15 @@ def test_a_team_that_comes_long_after_its_post_starts_on_the_floor_of_the_start(
         assert told.sigma_z_m < 0.5
 
 
+def test_a_team_without_barometers_is_on_one_level_whatever_its_post_has() -> None:
+    vertical = VerticalFilter(posts=frozenset({7}))
+    for second in range(400):
+        vertical.measure(Height(float(second), 7, 0.0), float(second))
+        vertical.move(Advance(float(second), 1, 1.0, 1.3, 0.0, 0.0, steps=1.8))
+        vertical.close(float(second))
+    assert vertical.of(1, 399.0).sigma_z_m < 0.2
+
+
 def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
     outcome = follow({1: [walk(30), stairs(3.5), walk(100)], 2: [walk(200)]}, begins_s={2: 100.0})
     vertical = outcome.filter

@@ -516,7 +516,7 @@ class VerticalFilter:
         """A node that never reported a height: it may have climbed since the start."""
         if not self.active:
             return Vertical()
-        grown = START_M**2 + UNSEEN_M**2 * max(time_s - self.first_s, 0.0)
+        grown = START_M**2 + UNSEEN_M**2 * max(time_s - self._worn_s, 0.0)
         return Vertical(0.0, min(math.sqrt(grown), UNKNOWN_M))
 
 
