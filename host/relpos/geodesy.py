@@ -135,8 +135,9 @@ class MapFrame:
 
     def altitude_of(self, z_m: float) -> float | None:
         """Return the height over the ellipsoid of a height in the team's frame; None if unknown."""
-        known = self.altitude_m is not None and math.isfinite(z_m)
-        return self.altitude_m + z_m if known and self.altitude_m is not None else None
+        if self.altitude_m is None or not math.isfinite(z_m):
+            return None
+        return self.altitude_m + z_m
 
     def course_deg(self, heading_rad: float) -> float:
         """Return the compass course, clockwise from true north in [0, 360), of a heading."""

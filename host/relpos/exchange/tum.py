@@ -70,11 +70,13 @@ def _point(where: str, words: Sequence[str], node: int, start_unix_s: float | No
             f"{where}: {len(words)} values, 8 are wanted: timestamp tx ty tz qx qy qz qw, "
             "separated by spaces"
         )
-    try:
-        time_s, x_m, y_m, z_m, qx, qy, qz, qw = (number(word) for word in words)
-    except ValueError as error:
-        bad = next(word for word in words if not _is_number(word))
-        raise DataError(f"{where}: {bad!r} {error}") from None
+    values: list[float] = []
+    for word in words:
+        try:
+            values.append(number(word))
+        except ValueError as error:
+            raise DataError(f"{where}: {word!r} {error}") from None
+    time_s, x_m, y_m, z_m, qx, qy, qz, qw = values
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     heading_rad = math.nan
     if norm > 0.0:
@@ -88,14 +90,6 @@ def _point(where: str, words: Sequence[str], node: int, start_unix_s: float | No
             )
         time_s = round(time_s - start_unix_s, 6)
     return Point(time_s, node, x_m, y_m, z_m, heading_rad)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        number(word)
-    except ValueError:
-        return False
-    return True
 
 
 def find_files(source: Path) -> list[Path]:
