@@ -27,6 +27,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from relpos.fusion.arrays import Floats
+from relpos.fusion.compiled import compiled
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, StripLayout
 
 
@@ -179,11 +180,18 @@ def _back_substitute(
         block[:m, :m] = later
         block[m:, :m] = others.T
         block[m:, m:] = blas.dgemm(1.0, regression, others, 1.0, rest, trans_a=1)
-        block[:] = np.tril(block) + np.tril(block, -1).T
+        _fill_upper(block)
         nodes = layout.nodes_of(k)
         moved[nodes, :2] = step.reshape(2, n, -1).swapaxes(0, 1)
         followed = blas.dgemm(1.0, regression, step, trans_a=1)
         moved[nodes, 2:] = followed.reshape(COVARIANCE - 2, n, -1).swapaxes(0, 1)
+
+
+@compiled
+def _fill_upper(matrix: Floats) -> None:
+    """Make the lower half of a symmetric matrix its upper one, too."""
+    for column in range(1, len(matrix)):
+        matrix[:column, column] = matrix[column, :column]
 
 
 def _lower(matrix: Floats) -> Floats:

@@ -427,13 +427,14 @@ class LargeTeam:
         inlier = f.update(Ranges(node, peer, measured, lift, counts, vague, outliers, slopes))
         self._correct_unseen(pairs, time_s, before[:, :2], prior)
         measured -= slopes @ f.terms
-        slant = np.sqrt(f.antenna_pairs(node, peer)[0] ** 2 + lift)
+        corrected = f.antenna_pairs(node, peer)
+        slant = np.sqrt(corrected[0] ** 2 + lift)
         self._outliers.learn(time_s, pairs, inlier, measured - slant)
         self._correlation.learn(pairs, innovation, inlier)
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
-        self._learn_sigma(f.antenna_pairs(node, peer), measured, lift, inlier)
+        self._learn_sigma(corrected, measured, lift, inlier)
         news = 1.0 - outliers[:, 0]
         self._inflate(time_s, both, np.tile(inlier, 2), np.tile(news, 2))
 

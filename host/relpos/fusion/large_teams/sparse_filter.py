@@ -262,7 +262,8 @@ class NeighbourhoodFilter:
         velocities along the sight: the node's clock dates a range, its peer is seen where it was
         when that clock was right, if its own is (``fusion/bank/range_update.py``).
         """
-        slopes = np.pad(common, ((0, 0), (0, len(self.terms) - TERMS)))
+        slopes = np.zeros((len(node), len(self.terms)))
+        slopes[:, :TERMS] = common
         if len(self.terms) > TERMS:
             ranges = np.arange(len(node))
             for end, speed_m_s in ((node, -peer_m_s), (peer, peer_m_s)):
@@ -361,6 +362,8 @@ class NeighbourhoodFilter:
 
     def antennas_m(self, rows: Indices) -> Floats:
         """Return where the antennas of nodes (E,) are now: (E, 2)."""
+        if not self.antenna_m.any():
+            return self.pose[rows, :2]
         x, y, heading = self.pose[rows].T
         forward, left = self.antenna_m[rows].T
         c, s = np.cos(heading), np.sin(heading)
@@ -382,7 +385,7 @@ class NeighbourhoodFilter:
         for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
             n = len(block) // COVARIANCE
             each = block.reshape((n, COVARIANCE, n, COVARIANCE), order="F")
-            result[self._layout.nodes_of(k)] = np.moveaxis(each.diagonal(axis1=0, axis2=2), 2, 0)
+            result[self._layout.nodes_of(k)] = each.diagonal(axis1=0, axis2=2).transpose(2, 0, 1)
         return result
 
     def inflate(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:
