@@ -114,6 +114,29 @@ def move(
         state[i, 2] = heading + moved[e, 2] - half * state[i, 3]
 
 
+@compiled
+def _move_block(block: Floats, rows: Floats, columns: Floats) -> None:
+    """F P G^T of one block, in place; F and G by the levers of its nodes (n, 3, 3), (p, 3, 3)."""
+    n, p = len(rows), len(columns)
+    for axis, by in LEVERS:
+        for j in range(COVARIANCE * p):
+            for i in range(n):
+                block[axis * n + i, j] += rows[i, axis, by] * block[(2 + by) * n + i, j]
+        for j in range(p):
+            for i in range(COVARIANCE * n):
+                block[i, axis * p + j] += columns[j, axis, by] * block[i, (2 + by) * p + j]
+
+
+@compiled
+def _add_noise(block: Floats, noise: Floats) -> None:
+    """Add what moving the nodes of a strip added to their own covariances (n, 7)."""
+    n = len(noise)
+    for k, (a, b) in enumerate(ENTRIES):
+        for i in range(n):
+            block[a * n + i, b * n + i] += noise[i, k]
+            block[b * n + i, a * n + i] = block[a * n + i, b * n + i]
+
+
 def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Floats) -> None:
     """Bring the blocks up to the poses: P <- F P F^T + Q, F from the levers, Q the noise.
 
@@ -124,16 +147,9 @@ def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Flo
     blocks = [*zip(diagonal, nodes, nodes, strict=True)]
     blocks += zip(following, nodes, nodes[1:], strict=False)
     for block, rows, columns in blocks:
-        n, p = len(rows), len(columns)
-        for axis, by in LEVERS:
-            down, right = slice((2 + by) * n, (3 + by) * n), slice((2 + by) * p, (3 + by) * p)
-            block[axis * n : axis * n + n] += lever[rows, axis, by, None] * block[down]
-            block[:, axis * p : axis * p + p] += lever[columns, axis, by] * block[:, right]
+        _move_block(block, lever[rows], lever[columns])
     for block, rows in zip(diagonal, nodes, strict=True):
-        own = len(rows) * np.arange(COVARIANCE)[:, None] + np.arange(len(rows))
-        for (a, b), added in zip(ENTRIES, noise[rows].T, strict=True):
-            block[own[a], own[b]] += added
-            block[own[b], own[a]] = block[own[a], own[b]]
+        _add_noise(block, noise[rows])
     lever[:] = 0.0
     noise[:] = 0.0
 
