@@ -1,5 +1,6 @@
 """What goes down to the nodes in a session: learned step scales, and orders to leave."""
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -17,8 +18,8 @@ from relpos.simulation.team import SCENARIOS
 class Conversation:
     """A team in memory with a sender at its port; keeps the newest motion of each node."""
 
-    def __init__(self, team, sender=StepScaleSender):
-        self.team, self.link = team, Link()
+    def __init__(self, team, sender=StepScaleSender, later_s=0.0):
+        self.team, self.link = team, Link(clock=lambda: time.time() + later_s)
         self.sender = sender(self.link)
         self.motions = {}
 
@@ -55,6 +56,21 @@ def test_who_is_called_out_has_the_led_on_until_nobody_calls():
         conversation.run(34.0)
         assert conversation.sender.lit() == []
         assert _led(conversation, 1, 42.0) == LED_HEALTH
+
+
+def test_an_order_of_a_new_session_is_not_taken_for_one_of_the_session_before():
+    with EmulatedTeam(TeamConfig("straight", 2, 60.0, 4)) as team:
+        before = Conversation(team, LedOrders)
+        before.run(3.0)
+        before.sender.call_out([1])
+        before.run(5.0)
+        before.sender.call_out([])
+        before.run(7.0)
+        anew = Conversation(team, LedOrders, later_s=60.0)
+        anew.sender.call_out([1])
+        anew.run(9.0)
+        assert (before.sender.lit(), anew.sender.lit()) == ([1], [1])
+        assert _led(anew, 1, 14.0) == LED_ON
 
 
 def _led(conversation, node, until_s):

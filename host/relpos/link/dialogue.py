@@ -60,7 +60,6 @@ class NodeDialogue:
         self._port = port
         self._clock = clock or stopwatch()
         self._batches = observe(port, self.link, self._clock)
-        self._token = int(time.time() * 10) % 0xFF00
         self._answers: dict[int, Acknowledged] = {}
         self.observations: deque[Observation] = deque(maxlen=MAX_KEPT)
         """The newest observations of all nodes."""
@@ -113,7 +112,7 @@ class NodeDialogue:
         raise DeviceError(f"node {self.node} stays busy and does not take {code.name}")
 
     def _ask(self, code: wire.CommandCode, value: int) -> Acknowledged:
-        token = self._next_token()
+        token = self.link.next_token()
         for attempt in range(ADDRESSED_ATTEMPTS + FURTHER_ATTEMPTS):
             further = attempt >= ADDRESSED_ATTEMPTS
             _, data = self.link.command(self.node, code, value, token=token)
@@ -127,10 +126,6 @@ class NodeDialogue:
             f"node {self.node} does not answer {code.name}: is it switched on and in reach, is its "
             f"number {self.node}, and is the key right?" + self._heard()
         )
-
-    def _next_token(self) -> int:
-        self._token = self._token % 0xFFFF + 1
-        return self._token
 
     def _send(self, token: int, data: bytes, wait_s: float = ANSWER_S) -> Acknowledged | None:
         """Send once; return the answer, or None where none comes in time."""
@@ -242,7 +237,7 @@ class NodeDialogue:
         if old == wire.DEFAULT_KEY and not getattr(self._port, "by_cable", False):
             raise DeviceError(NEEDS_CABLE.format(node=self.node))
         keys = new + framing.node_key(team_key, wire.BROADCAST)
-        token = self._next_token()
+        token = self.link.next_token()
         for _ in range(FURTHER_ATTEMPTS):
             answer = self._send(token, link.new_keys(self.node, keys, token=token))
             # It answers under the new key, also where that answer is lost: the old key is gone.
@@ -257,7 +252,7 @@ class NodeDialogue:
         )
 
     def _answers_under_present_key(self) -> bool:
-        token = self._next_token()
+        token = self.link.next_token()
         data = b"".join(
             self.link.command(
                 self.node, wire.CommandCode.PING, 0, token=token, broadcast=broadcast

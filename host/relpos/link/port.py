@@ -83,7 +83,8 @@ class Link:
         """Of nodes that have another key than the team's gives them, while that changes."""
         self._clock = clock or time.time
         self._counters: dict[int, HostCounter] = {}
-        self._token = 0
+        # Not from 0: a node answers for what an earlier session sent it under the same token.
+        self._token = int(self._clock() * 10) % 0xFFFF
         self.virtual_s: float | None = None
         """Virtual time of an emulated team that marks it; None for a real team."""
         self._faults_told: set[int] = set()
