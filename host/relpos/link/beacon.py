@@ -55,7 +55,7 @@ class BeaconSchedule:
 
     def heard(self, node: int, time_s: float) -> None:
         """Note a frame of ``node``."""
-        self._heard_s[node] = max(time_s, self._heard_s.get(node, time_s))
+        self._heard_s[node] = time_s
 
     def team(self, now_s: float) -> tuple[int, ...]:
         """Return the ids in the order of their slots."""
@@ -119,8 +119,7 @@ class HostBeacons:
         if self._link.virtual_s is not None:
             return b""
         for node, track in self._link.decoder.nodes.items():
-            if track.heard:
-                self.schedule.heard(node, track.arrival_s)
+            self.schedule.heard(node, track.arrival_s)
         values = self.schedule.due(now_s)
         if values is None:
             return b""

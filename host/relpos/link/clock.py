@@ -57,9 +57,7 @@ class NodeClock:
         self._fit()
 
     def to_host_s(self, node_s: float) -> float:
-        """Return the host time of ``node_s`` (wrapped); ValueError before the first observation."""
-        if self._newest_s is None:
-            raise ValueError("no frame of this node has arrived yet")
+        """Return the host time of ``node_s`` (wrapped)."""
         unwrapped_s = self.unwrap(node_s)
         return unwrapped_s + self._offset_s + self.drift * (unwrapped_s - self._reference_s)
 
@@ -69,7 +67,8 @@ class NodeClock:
         if points[-1][0] - points[0][0] < MIN_SPAN_S:
             self._set(mean_s, 0.0, points)
             return
-        left, right = _edge_below(_lower_hull(points), mean_s)
+        # The hull's edge that lies below the mean.
+        left, right = next(e for e in pairwise(_lower_hull(points)) if mean_s <= e[1][0])
         drift = (right[1] - left[1]) / (right[0] - left[0])
         self._set(mean_s, min(max(drift, -DRIFT_LIMIT), DRIFT_LIMIT), points)
 
@@ -80,11 +79,9 @@ class NodeClock:
 
 
 def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Lower convex hull of points sorted by abscissa (Andrew's monotone chain)."""
+    """Lower convex hull of sorted points (Andrew's monotone chain)."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
-        while hull and hull[-1][0] == x and hull[-1][1] >= y:
-            hull.pop()
         if hull and hull[-1][0] == x:
             continue
         while len(hull) >= 2:
@@ -94,13 +91,3 @@ def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
             hull.pop()
         hull.append((x, y))
     return hull
-
-
-def _edge_below(
-    hull: list[tuple[float, float]], at: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The hull's edge whose abscissae enclose ``at``."""
-    for left, right in pairwise(hull):
-        if left[0] <= at <= right[0]:
-            return left, right
-    return hull[-2], hull[-1]

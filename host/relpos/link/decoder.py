@@ -299,7 +299,7 @@ class Decoder:
         """Return the node's track and store the counter if the frame is new; else None."""
         track = self.nodes.get(frame.node)
         if track is None:
-            track = NodeTrack(frame.boot, arrival_s=arrival_s)
+            track = NodeTrack(frame.boot)
             if frame.node in self._newest_counters:
                 track.window = CounterWindow.after(self._newest_counters[frame.node])
         window = track.window
@@ -352,7 +352,6 @@ class Decoder:
             frame.boot,
             window=window,
             counts=track.counts,
-            arrival_s=arrival_s,
             motion_s=track.motion_s,
             unseen_s=silence_s if track.totals is not None else 0.0,
             height_m=track.height_m,

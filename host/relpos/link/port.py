@@ -99,7 +99,7 @@ class Link:
 
     def newest_counters(self) -> dict[int, int]:
         """Return the newest counter of each node heard, for the next session."""
-        return {n: track.window.newest for n, track in self.decoder.nodes.items() if track.heard}
+        return {n: track.window.newest for n, track in self.decoder.nodes.items()}
 
     def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
         """Return the observations completed by ``data``, whose last byte arrived at ``arrival_s``.
@@ -370,4 +370,4 @@ def observe(
     while True:
         with plugged_in(device):
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
-        yield link.feed(data, clock()) if data else []
+        yield link.feed(data, clock())
