@@ -381,6 +381,10 @@ def test_a_restart_on_the_second_floor_leaves_the_node_there():
     assert height(4, 6, time_s=1) == []
     assert height(5, 6, time_s=5, height_m=-3.0, quality=valid) == pytest.approx([3.0])
     assert height(6, 6, time_s=6, height_m=-6.0, quality=valid) == pytest.approx([0.0])
+    assert height(7, 6, time_s=7, height_m=-4.0, quality=valid) == pytest.approx([2.0])
+    for n in (8, 9):  # twice, before it knows a height
+        assert height(n, n, time_s=1) == []
+    assert height(10, 9, time_s=5, height_m=1.0, quality=valid) == pytest.approx([3.0])
 
 
 def test_a_frame_held_up_from_before_the_restart_is_refused():
