@@ -27,10 +27,21 @@ from relpos.fusion.estimator import (
     Shape,
 )
 from relpos.live.inputs import run_items
-from relpos.measurements import BOUNDS, Heading, Height, Motion, Observation, Prior, Range, Step
+from relpos.measurements import (
+    BOUNDS,
+    Event,
+    Heading,
+    Height,
+    Motion,
+    Observation,
+    Prior,
+    Range,
+    Step,
+)
 from relpos.recording import topics
 from relpos.runs import (
     InitialPose,
+    Run,
     load_run,
     read_estimates,
     save_run,
@@ -117,6 +128,17 @@ def test_optional_cells_may_be_empty(tmp_path: Path) -> None:
         Motion(1.0, 1, 0, 0, 0, None, 0.1, None, None, moving=True),
         Motion(2.0, 1, 0, 0, 0, 0.2, None, None, gain_version=3),
     )
+    write(tmp_path, events_csv="time_s,node,event,value\n1,1,landmark,\n")
+    assert load_run(tmp_path).events == (Event(1.0, 1, "landmark", ""),)
+
+
+@pytest.mark.parametrize(("every_s", "dx_m"), [(1, 0.004), (3, 2.0)])
+def test_neither_a_long_rest_nor_sparse_rows_look_like_milliseconds(
+    tmp_path: Path, every_s: int, dx_m: float
+) -> None:
+    rows = "".join(f"{every_s * n},1,{dx_m},0,0\n" for n in range(3000))
+    write(tmp_path, motion_csv="time_s,node,dx_m,dy_m,dtheta_rad\n" + rows)
+    assert len(load_run(tmp_path).motions) == 3000
 
 
 def test_unsorted_rows_are_sorted_and_equal_times_keep_their_order(tmp_path: Path) -> None:
@@ -271,10 +293,14 @@ def load_run_imu(directory: Path) -> object:
         ("name = ", "not TOML"),
         ('initial_pose = "somewhere"', 'key initial_pose: "somewhere" is none of'),
         ("heading_known = 1", "key heading_known: 1 is neither true nor false"),
+        ("name = 5", "key name: 5 is not text"),
         ("[initial.1]\nx_m = 1.0\ny_m = 2.0", "key initial.1.heading_rad is missing"),
         ("[initial.a]\nx_m = 1.0", "table initial.a: 'a' is no node id"),
         ('[nodes.1]\nstature_m = "tall"', "key nodes.1.stature_m: 'tall' is not a number"),
         ("[nodes.1]\nantenna_offset_m = [1.0]", "is not [forward, left]"),
+        ("[nodes.1]\nantenna_offset_m = 5", "is not [forward, left]"),
+        ('[nodes."²"]\nname = "n"', "is no node id"),
+        ("[building]\nfloors_m = [3.0, 6.0]", "does not go from the lowest floor over"),
         ("[initial.1]\nx_m = nan\ny_m = 2\nheading_rad = 0", "is not a finite number"),
     ],
 )
@@ -331,7 +357,7 @@ def test_a_common_start_puts_every_node_on_one_place(tmp_path: Path) -> None:
 
 
 def test_a_start_from_truth_takes_the_first_pose_alone(tmp_path: Path) -> None:
-    truth = "time_s,node,x_m,y_m,heading_rad\n5,1,9,9,9\n0,1,1,2,0.5\n0,2,3,4,\n"
+    truth = "time_s,node,x_m,y_m,heading_rad\n1,1,9,9,9\n0,1,1,2,0.5\n0,2,3,4,\n"
     write(tmp_path, run_toml='initial_pose = "from truth"', motion_csv=MOTION, truth_csv=truth)
     first, second = load_run(tmp_path).priors
     assert first == Prior(1, 1.0, 2.0, 0.5, 0.0, 0.0)
@@ -360,14 +386,15 @@ def test_landmark_presses_make_the_truth(tmp_path: Path) -> None:
         tmp_path,
         landmarks_csv="id,x_m,y_m,z_m\nA,1,2,3\n7,4,5,\n",
         events_csv="time_s,node,event,value\n9,1,landmark,7\n3,1,landmark,A\n"
-        "5,1,landmark,nowhere\n6,1,mark,A\n",
+        "5,1,landmark,nowhere\n6,1,mark,A\n10,1,landmark,7\n20,1,landmark,7\n",
     )
     run = load_run(tmp_path)
     assert [(t.time_s, t.x_m, t.y_m, t.z_m) for t in run.truth] == [
         (3.0, 1.0, 2.0, 3.0),
         (9.0, 4.0, 5.0, None),
+        (20.0, 4.0, 5.0, None),
     ]
-    assert run.counters["landmarks_unknown"] == 1
+    assert (run.counters["landmarks_unknown"], run.counters["landmarks_repeated"]) == (1, 1)
 
 
 def test_inertial_data_are_sorted_and_split_by_node(tmp_path: Path) -> None:
@@ -429,8 +456,9 @@ def test_a_saved_run_reads_back_the_same(tmp_path: Path) -> None:
     source.mkdir()
     write(
         source,
-        run_toml='name = "a \\"b\\""\nheading_known = true\n[initial.1]\nx_m = 1\ny_m = 0.1\n'
-        "heading_rad = 2\n[nodes.1]\nantenna_offset_m = [0.1, 0.2]\n",
+        run_toml='name = "a \\"b\\""\nheading_known = true\ninitial_pose = "common"\n'
+        "[initial.1]\nx_m = 1\ny_m = 0.1\nheading_rad = 2\n"
+        "[nodes.1]\nantenna_offset_m = [0.1, 0.2]\n",
         motion_csv=MOTION,
         ranges_csv="time_s,node,peer,range_m,rss_dbm\n0.1,1,2,0,\n0.30000000000000004,1,2,3,-80\n",
         height_csv="time_s,node,height_m\n0,1,0.5\n",
@@ -455,6 +483,12 @@ def test_a_saved_run_reads_back_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         after.load_imu()[1].magnetic_field_ut, before.load_imu()[1].magnetic_field_ut
     )
+
+
+def test_a_saved_run_leaves_nothing_of_the_run_that_was_there(tmp_path: Path) -> None:
+    write(tmp_path, motion_csv=MOTION, landmarks_csv="id,x_m,y_m\nA,1,2\n", imu_csv=IMU_HEADER)
+    save_run(Run("empty"), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["run.toml"]
 
 
 def test_the_airs_pressure_is_saved(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from relpos.runs.table import (
     number,
     numbered_rows,
     read_text,
+    whole,
 )
 
 T = TypeVar("T")
@@ -48,13 +49,6 @@ def _one_of(words: type[StrEnum]) -> Parser:
             raise ValueError(f"is none of {', '.join(words)}") from None
 
     return parse
-
-
-def _whole(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise ValueError("is negative")
-    return value
 
 
 _ESTIMATE_TABLE = (
@@ -73,7 +67,7 @@ _ESTIMATE_TABLE = (
     Column("status", _one_of(NodeStatus), optional=True),
     Column("episode", _one_of(Episode), optional=True),
     Column("episode_probability", not_negative, optional=True),
-    Column("floor", int, optional=True),
+    Column("floor", whole, optional=True),
     Column("floor_probability", not_negative, optional=True),
 )
 _PAIR_TABLE = (
@@ -88,7 +82,7 @@ _PAIR_TABLE = (
 )
 _ALTERNATIVE_TABLE = (
     Column("time_s", bounded("time_s")),
-    Column("alternative", _whole),
+    Column("alternative", whole),
     Column("probability", not_negative),
     Column("node", node_id),
     Column("x_m", number),

@@ -378,7 +378,7 @@ class _Table:
         return [field.name for field in fields(self.kind)]
 
     def read(self, directory: Path, counters: Counter[str]) -> list[Any]:
-        """Rows sorted by time, rows at the same time in the order of the file."""
+        """Rows in the order of the file."""
         path = find_table(directory, self.name)
         if path is None:
             return []
@@ -397,7 +397,6 @@ class _Table:
             row.time_s < before_s - ARRIVES_WITHIN_S
             for row, before_s in zip(rows, newest, strict=True)
         )
-        rows.sort(key=attrgetter("time_s"))
         return rows
 
 
@@ -466,7 +465,6 @@ def _priors_from_truth(run: Run) -> dict[int, Prior]:
             row.x_m,
             row.y_m,
             row.heading_rad if row.heading_rad is not None else 0.0,
-            sigma_m=0.0,
             sigma_rad=0.0 if row.heading_rad is not None else math.inf,
         )
     return priors
