@@ -138,8 +138,11 @@ def make_session(
     return LiveSession(source, fusion, composer, [album, *sinks], pace=pace, **options), album
 
 
-def run_through(session):
-    """Run it to its end; the outcome."""
+def run_through(session, *, survives=()):
+    """Run it to its end; the outcome. Of all that it can survive it has met ``survives`` alone."""
     for _ in session.run():
         pass
-    return session.finish()
+    outcome = session.finish()
+    survived = {f"{what}s_failed" for what in ("update", "view", "request", "event")}
+    assert survived & outcome.counters.keys() == set(survives)
+    return outcome

@@ -76,6 +76,7 @@ def test_an_evacuation_knows_for_each_whether_it_was_shown_and_understood():
         event("board", node=1, state="gone"),
         event("board", node=1, team="x" * 41),
         event("board", node=1, team=3),
+        event("board", node=1, team="two\nlines"),
         event("board", node=1, air_bar=1e9),
         event("board", node=1, air_bar=math.nan),
         event("board", node=1, air_bar="full"),
@@ -113,6 +114,11 @@ def test_what_a_request_lacks_is_named_in_plain_words(kind, lacking):
         (event("marker", id="m", action="set", sign=["exit"]), "sign: none of "),
         (event("plan", action="set", image=5), "image: not the name of an image"),
         (event("board", node=[2], state="entered"), "board: a value is of the wrong type"),
+        (event("floor", floor="1", name="attic"), "floor: not a number from -100 to 100"),
+        (event("floor", floor=1, name="x" * 41), "name: not at most 40 printable characters"),
+        (event("marker", id="", action="remove"), "id: not 1 to 40 printable characters"),
+        (event("marker", id="m", action="remove"), "no such marker"),
+        (event("plan", action="remove"), "there is no plan"),
     ],
     ids=str,
 )
@@ -131,6 +137,18 @@ def test_a_marker_is_set_once_and_nobody_changes_its_sign_or_moves_it():
     with pytest.raises(BoardError, match="id: another marker has it"):
         board.apply(event("marker", sign="exit", by="Chief", **marker))
     assert (board.markers["haz"].sign, board.markers["haz"].x_m) == ("hazard", 1.0)
+
+
+def test_a_marker_a_plan_and_the_name_of_a_floor_are_taken_away_again():
+    board = Board()
+    board.apply(event("marker", id="m", action="set", sign="exit", x_m=1.0, y_m=2.0))
+    board.apply(event("plan", action="set", image="plan.png"))
+    board.apply(event("floor", floor=-1, name=" cellar "))
+    assert (list(board.markers), board.floors) == (["m"], {-1: "cellar"})
+    board.apply(event("marker", id="m", action="remove"))
+    board.apply(event("plan", action="remove", image="plan.png"))
+    board.apply(event("floor", floor=-1, name=" "))
+    assert board == Board()
 
 
 @pytest.mark.parametrize("within_s", [600, 600.0, "600"])

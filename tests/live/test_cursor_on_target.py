@@ -293,6 +293,10 @@ def test_an_alarm_is_told_at_once_to_a_server_that_is_back(schedule: Schedule) -
     assert "test.3-9-1-1" not in due(schedule, team_view(2, changes=still), 2.0)
     schedule.again()
     assert "test.3-9-1-1" in due(schedule, team_view(3, changes=still), 4.0)
+    schedule.again()
+    silent = {3: {"alert": Alert.LOST, "status": "lost", "seen_s": 12.0}}
+    alarm = due(schedule, team_view(4, changes=silent), 6.0)["test.3-9-1-1"]
+    assert alarm.type == "b-a-o-tbl", "who falls silent has not got up"
 
 
 def test_what_a_session_has_sent_lapses_by_itself_and_is_repeated_before_it_does(

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from relpos.live.alarms import LOST_S, Alarms, moved
+from relpos.live.alarms import LOST_S, Alarms, KnownAlert, moved
 from relpos.live.composer import Composer
 from relpos.live.team_view import Alert
 from relpos.measurements import Motion
@@ -164,6 +164,20 @@ def test_a_motionless_alarm_stays_when_the_radio_falls_silent(watching):
     watching.report(still, 35)
     watching.report(None, 30)
     assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
+
+
+@pytest.mark.parametrize(
+    ("alert", "raised_s"), [(Alert.STILL_ALARM, 100.0), (Alert.STILL_WARNING, 115.0)]
+)
+def test_stillness_of_a_session_before_goes_on_with_who_has_seen_it(alert, raised_s):
+    alarms = Alarms()
+    alarms.remember(1, 122.0, 123.0, KnownAlert(alert, raised_s, seen=True, by="Chief"))
+    alarms.tick(123.0, listening=True)
+    alarms.add_motion(still(124.0))
+    alarms.tick(123.0, listening=True)
+    condition = alarms.condition(1)
+    assert (condition.alert, condition.acknowledged_by, alarms.changes) == (alert, "Chief", [])
+    assert condition.still_s == pytest.approx(54.0 if alert is Alert.STILL_ALARM else 29.0)
 
 
 def test_a_first_report_is_no_movement_of_now():

@@ -12,11 +12,14 @@ from team_input import make_session
 from relpos import fusion
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
+from relpos.fusion.estimator import Estimate, Parameter
 from relpos.link import xbee
 from relpos.link.port import Link
 from relpos.live import inputs
 from relpos.live.inputs import PortInput
 from relpos.measurements import Motion
+from relpos.protocol import framing
+from relpos.protocol import messages as wire
 from support.command import relpos
 
 
@@ -43,6 +46,9 @@ class Socket:
 
     def write(self, data: bytes) -> None:
         os.write(self._ours, data)
+
+    def read(self) -> bytes:
+        return os.read(self._ours, 4096)
 
 
 @pytest.fixture
@@ -190,6 +196,26 @@ def test_bytes_that_arrive_together_are_received_together(socket, stream):
     received = source.read(1.0)
     source.close()
     assert received.data == b"".join(pieces[:5]), "not a byte first, and the rest later"
+
+
+def test_orders_and_learned_steps_go_out_of_the_port_and_answers_come_back(socket):
+    source = PortInput(str(socket.path), Link())
+    source.call_out([1])
+    source.learn(Estimate(0.0, (), (), (), (Parameter(0.0, 1, None, "step_scale", 1.1, 0.01),)))
+    source.read(0.0)
+    sent = [
+        framing.decode(frame.data, wire.DEFAULT_KEY).values
+        for frame in xbee.Parser().feed(socket.read())
+    ]
+    codes = [wire.CommandCode.SET_LED, wire.CommandCode.SET_STEP_GAIN_PERMILLE]
+    assert [command["command"] for command in sent] == codes
+    values = {**sent[0], "result": wire.CommandResult.DONE}
+    answer = framing.encode(wire.ACKNOWLEDGEMENT, 1, 0, 0, values)
+    socket.write(xbee.encode(xbee.Receive16(1, -40, answer)))
+    source.read(1.0)
+    source.read(0.0)
+    assert (source.called_out(), source.called_out()) == ([1], [])
+    source.close()
 
 
 def test_a_setting_that_does_not_fit_is_reported_before_the_port_is_opened(socket):

@@ -57,6 +57,12 @@ def test_the_same_press_counts_once_however_often_it_is_sent(handler):
     assert [event.value for event in again[1]] == ["5"]
 
 
+def test_a_press_that_a_session_before_has_accepted_counts_no_second_time(handler):
+    handler.accept(["a"])
+    again = handler.presses(presses(("a", "4", unix_ms(10.0)), arrived_s=600.0))
+    assert again == ({"accepted": ["a"]}, [])
+
+
 def test_the_age_of_a_press_counts_when_a_clock_was_set_meanwhile(handler):
     # By the offset it would have been sent an hour ago: but it was sent now, 5 s after the press.
     request = presses(

@@ -20,6 +20,7 @@ from relpos.link.port import Link
 from relpos.live.assembly import SessionPlan, run_session
 from relpos.live.composer import Composer
 from relpos.live.inputs import PacedInput, PortInput, Received
+from relpos.live.notices import REMARK_S, NoticeBoard
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
@@ -261,7 +262,7 @@ def test_no_request_reply_name_or_view_ends_a_session():
         source, fragile = TeamInput(team), Fragile()
         phones = Phones(source, (3.0, Request(1, "name", 0.0, {"node": 2, "name": "Kim"})))
         session, album = make_session(source, deadreckoning, fragile, phones, priors=team.priors())
-        outcome = run_through(session)
+        outcome = run_through(session, survives=["requests_failed"])
     assert outcome.failure is None
     assert album.views[-1].time_s > 7.0
     assert fragile.answer == 500
@@ -463,6 +464,15 @@ def test_a_recording_is_played_and_takes_no_presses():
     # Nothing is known of a link, and nothing made up.
     assert last.people[1].rssi_dbm is None
     assert math.isfinite(last.time_s)
+
+
+def test_a_remark_is_shown_for_a_minute():
+    board = NoticeBoard(lambda: 10.0)
+    board.post_remark("a node has another version")
+    board.drop_expired(10.0 + REMARK_S)
+    assert [notice.text for notice in board.all()] == ["a node has another version"]
+    board.drop_expired(10.1 + REMARK_S)
+    assert list(board.all()) == []
 
 
 def test_nodes_received_first_share_one_start_with_a_common_start():

@@ -194,7 +194,7 @@ class Nowcast:
             variance_x_m2=pose.xx,
             variance_y_m2=pose.yy,
             covariance_xy_m2=pose.xy,
-            sigma_heading_rad=min(math.sqrt(max(pose.tt, 0.0)), ANY_ANGLE_RAD),
+            sigma_heading_rad=min(math.sqrt(pose.tt), ANY_ANGLE_RAD),
         )
 
     def pair(self, fused: PairEstimate) -> PairEstimate:
