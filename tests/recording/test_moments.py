@@ -19,7 +19,7 @@ from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.live.mission import JOURNAL, Journal, Mission
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Alert
+from relpos.live.team_view import Alert, LogEntry
 from relpos.measurements import Motion
 from relpos.recording import open_recording, topics
 from relpos.recording.moments import Moments
@@ -182,29 +182,36 @@ class Page(Sink):
 def test_a_recording_is_moved_to_any_moment_and_to_its_events(recorded):
     path, _ = recorded
     page = Page()
-    player = Player(Moments([path]), [page])
+    log = [LogEntry(at_s, 0.0, "note", "a note") for at_s in (15.0, 20.0)]
+    moments = Moments([path])
+    player = Player(moments, [page], log)
     while not player.history.complete:
         time.sleep(0.01)
-    for body in ({"playing": False}, {"at_s": 12.0}):
+    for body in ({"playing": False}, {"at_s": 12.0}, {"speed": 99.0}):
         page.asks.append(Request(1, "replay", 0.0, body))
     player.run(0.1)
     assert page.views[-1].time_s == 12.0
-    assert page.timeline["playing"] is False
+    assert (page.timeline["playing"], page.timeline["speed"]) == (False, 30.0)
     assert [p.node for p in page.views[-1].people] == [1, 2, 3]
     assert all(p.seen_s < 3.0 for p in page.views[-1].people)
-    ticks = [at_s for at_s, _, _ in page.timeline["ticks"]]
-    for at_s in [t for t in ticks if t > 12.5][:2]:
-        page.asks.append(Request(2, "replay", 0.0, {"step": 1}))
+    stepped = []
+    for step in (1, 1, 1, -1, -1, -1):
+        page.asks.append(Request(2, "replay", 0.0, {"step": step}))
         player.run(0.05)
-        assert page.views[-1].time_s == at_s
+        stepped.append(page.views[-1].time_s)
+    assert stepped == [15.0, 20.0, moments.to_s, 20.0, 15.0, moments.from_s]
+    assert page.views[-1].fused_s is None, "nothing was estimated yet"
     page.asks.append(Request(3, "name", 0.0, {"node": 1, "name": "x"}))
     player.run(0.05)
     assert page.answers[-1][1] == 409
+    page.asks.append(Request(4, "end", 0.0, {}))
+    player.run()
+    assert player.ended
 
 
 def test_alerts_of_a_moment_are_those_that_were_then():
     class Rows:
-        started_unix_s, from_s, to_s = 0.0, 0.0, 60.0
+        started_unix_s, from_s, to_s = 1000.0, 0.0, 60.0
 
         def rows(self, *_):
             for second in range(60):
@@ -220,6 +227,7 @@ def test_alerts_of_a_moment_are_those_that_were_then():
     assert history.alert(2, 42.0)[1] is Alert.STILL_ALARM
     assert history.heard(2, 59.0) == 44.0
     assert any(e.text.startswith("Ben") for e in history.events)
+    assert all(e.unix_s == 1000.0 + e.time_s for e in history.events)
     posts = History()
     posts.read(Rows(), {}, (), frozenset({2}))
     assert posts.alert(2, 42.0)[1] is None, "the command post's node lies still"
