@@ -60,7 +60,6 @@ class NodeTrack:
     boot: int
     clock: NodeClock = field(default_factory=NodeClock)
     window: CounterWindow = field(default_factory=CounterWindow)
-    heard: bool = False
     totals: Mapping[str, Any] | None = None
     motion_s: float | None = None
     arrival_s: float = 0.0
@@ -324,16 +323,15 @@ class Decoder:
         if frame.boot != track.boot and verdict is Verdict.LATE:
             track.counts["stale_boot"] += 1
             return None
-        if frame.boot != track.boot and track.heard:
+        if frame.boot != track.boot:
             track = self._restarted(track, frame, window, arrival_s)
             track.counts["restarts"] += 1
         elif verdict is Verdict.LATE:
             track.counts["lost"] -= 1
             track.counts["reordered"] += 1
-        elif track.heard:
+        elif frame.node in self.nodes:
             track.counts["lost"] += frame.counter - window.newest - 1
         self.nodes[frame.node] = track
-        track.heard = True
         window.add(frame.counter)
         self._misfits[frame.node] = 0
         track.counts["received"] += 1
@@ -364,7 +362,7 @@ class Decoder:
         node = frame.node
         track.counts[verdict.value] += 1
         # For a node not heard since the start, a "duplicate" is from an earlier session.
-        if verdict is Verdict.DUPLICATE and track.heard:
+        if verdict is Verdict.DUPLICATE and node in self.nodes:
             return
         self._misfits[node] += 1
         challenged_s, _ = self._challenged.get(node, (-math.inf, None))

@@ -8,6 +8,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import urlsplit
@@ -230,15 +231,7 @@ class Link:
 
     def summary(self) -> dict[str, float]:
         """Return the counts of the whole link: frames, losses, rejections."""
-        counters: dict[str, float] = dict(self.decoder.counts)
-        parsed = self.parser.counts
-        counters |= {
-            "frames": parsed.frames,
-            "bad_checksums": parsed.bad_checksums,
-            "bad_lengths": parsed.bad_lengths,
-            "broken_off": parsed.broken_off,
-            "skipped_bytes": parsed.skipped_bytes,
-        }
+        counters: dict[str, float] = {**self.decoder.counts, **asdict(self.parser.counts)}
         for track in self.decoder.nodes.values():
             for name, count in track.counts.items():
                 counters[name] = counters.get(name, 0) + count

@@ -31,6 +31,7 @@ from relpos.recording.container import (
 )
 from relpos.recording.output import parts_of
 from relpos.recording.schemas import all_topics
+from relpos.runs.description import Description
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, assemble
 from relpos.version import __version__
@@ -285,8 +286,6 @@ class Recording:
             "recording_blocks_damaged": sum(file.damaged for file in self.files),
             "recording_gaps": sum(1 for _ in self.entries({topics.GAP})),
         }
-        from relpos.runs.description import Description
-
         description = self.about.description if self.about else Description()
         return assemble(
             description.name or self.path.stem,
