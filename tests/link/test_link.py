@@ -321,12 +321,14 @@ def test_a_restart_before_the_first_motion_widens_nothing():
     assert (motion.sigma_x_m, motion.sigma_y_m, motion.sigma_theta_rad) == (0.0, 0.0, 0.0)
 
 
-def test_variances_across_add_up_as_they_are_reported():
+def test_variances_across_and_of_the_heading_add_up_as_they_are_reported():
     decoder = Decoder()
-    decoder.feed(motion_frame(0, time_s=1, variance_across_m2=0.25), 1.0)
-    frame = motion_frame(1, time_s=2, variance_across_m2=0.34, variance_along_m2=0.0)
-    (motion,) = motions(decoder.feed(frame, 2.0))
+    before = {"variance_across_m2": 0.25, "variance_heading_rad2": 0.02}
+    decoder.feed(motion_frame(0, time_s=1, **before), 1.0)
+    after = {"variance_across_m2": 0.34, "variance_heading_rad2": 0.06}
+    (motion,) = motions(decoder.feed(motion_frame(1, time_s=2, **after), 2.0))
     assert motion.sigma_y_m == pytest.approx(0.3, abs=1e-3)
+    assert motion.sigma_theta_rad == pytest.approx(0.2, abs=1e-3)
 
 
 def test_a_silent_inertial_sensor_tells_no_motion_and_then_all_of_it_at_once():
@@ -527,6 +529,8 @@ def test_a_command_reaches_the_node_as_the_wire_says():
     frame = framing.decode(request.data)
     assert request.destination == 7
     assert dict(frame.values) == {"token": token, "command": 4, "value": 930}
+    _, data = link.command(7, wire.CommandCode.SET_LEG_LENGTH_MM, 930, broadcast=True)
+    assert xbee.Parser().feed(data)[0].destination == xbee.BROADCAST_16
 
 
 def test_status_figures_carry_the_links_own_counts():
@@ -563,8 +567,9 @@ def test_virtual_time_is_taken_from_an_emulated_team_alone_and_never_goes_back()
     link.feed(from_node(1), 0.5)
     link.feed(mark(5, size=7), 0.5)
     link.feed(mark(2**63), 0.5)
+    link.feed(xbee.encode(xbee.UnknownFrame(0xA1, bytes(8))), 0.5)
     assert link.virtual_s is None
     link.feed(mark(7_000_000), 0.6)
     link.feed(mark(6_000_000), 0.7)
     assert link.virtual_s == 7.0
-    assert link.decoder.counts["UnknownFrame"] == 3
+    assert link.decoder.counts["UnknownFrame"] == 4

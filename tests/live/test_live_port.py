@@ -3,6 +3,7 @@
 import itertools
 import os
 import pty
+import select
 import tty
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from relpos.measurements import Motion
 from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from support.command import relpos
+from support.waiting import until
 
 
 class Socket:
@@ -47,8 +49,11 @@ class Socket:
     def write(self, data: bytes) -> None:
         os.write(self._ours, data)
 
-    def read(self) -> bytes:
-        return os.read(self._ours, 4096)
+    def frames(self, count: int) -> list[xbee.ApiFrame]:
+        parser, found = xbee.Parser(), []
+        while len(found) < count and select.select([self._ours], [], [], 5.0)[0]:
+            found += parser.feed(os.read(self._ours, 4096))
+        return found
 
 
 @pytest.fixture
@@ -203,16 +208,13 @@ def test_orders_and_learned_steps_go_out_of_the_port_and_answers_come_back(socke
     source.call_out([1])
     source.learn(Estimate(0.0, (), (), (), (Parameter(0.0, 1, None, "step_scale", 1.1, 0.01),)))
     source.read(0.0)
-    sent = [
-        framing.decode(frame.data, wire.DEFAULT_KEY).values
-        for frame in xbee.Parser().feed(socket.read())
-    ]
+    sent = [framing.decode(frame.data, wire.DEFAULT_KEY).values for frame in socket.frames(2)]
     codes = [wire.CommandCode.SET_LED, wire.CommandCode.SET_STEP_GAIN_PERMILLE]
     assert [command["command"] for command in sent] == codes
     values = {**sent[0], "result": wire.CommandResult.DONE}
     answer = framing.encode(wire.ACKNOWLEDGEMENT, 1, 0, 0, values)
     socket.write(xbee.encode(xbee.Receive16(1, -40, answer)))
-    source.read(1.0)
+    until(lambda: source.read(0.1) and source.link.decoder.acknowledged, "the answer")
     source.read(0.0)
     assert (source.called_out(), source.called_out()) == ([1], [])
     source.close()

@@ -333,7 +333,7 @@ def vanished(device: Line, error: Exception) -> DeviceError:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
+    if "exclusively lock" in str(error):
         return "another program has it open"
     # termios says so, and pyserial's own error has no number.
     if getattr(error.__context__, "args", ())[:1] == (errno.ENOTTY,):

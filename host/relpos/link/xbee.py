@@ -250,9 +250,9 @@ class Parser:
         self.counts.skipped_bytes += count
         del self._buffer[:count]
 
-    def _reject(self, used: int) -> tuple[None, bool]:
-        # AP=1: only the delimiter is known to be wrong. AP=2: no frame can start inside.
-        self._skip(used if self.escaped else 1)
+    def _reject(self) -> tuple[None, bool]:
+        # Only the delimiter is known to be wrong: in AP=1 the next one may stand inside.
+        self._skip(1)
         return None, True
 
     def _parse_one(self) -> tuple[ApiFrame | None, bool]:
@@ -260,35 +260,28 @@ class Parser:
         plain = bytearray()
         position = 1
         while position < len(self._buffer):
-            byte = self._buffer[position]
-            if self.escaped:
-                if byte == DELIMITER:
-                    self.counts.broken_off += 1
-                    self._skip(position)
-                    return None, True
-                if byte == ESCAPE:
-                    if position + 1 == len(self._buffer):
-                        return None, False
-                    following = self._buffer[position + 1]
-                    if following == DELIMITER:
-                        self.counts.broken_off += 1
-                        self._skip(position + 1)
-                        return None, True
-                    byte = following ^ ESCAPE_XOR
-                    position += 1
-            plain.append(byte)
+            byte, mask = self._buffer[position], 0
+            if self.escaped and byte == ESCAPE:
+                position += 1
+                if position == len(self._buffer):
+                    break
+                byte, mask = self._buffer[position], ESCAPE_XOR
+            if self.escaped and byte == DELIMITER:
+                self.counts.broken_off += 1
+                return self._reject()
+            plain.append(byte ^ mask)
             position += 1
             if len(plain) < 2:
                 continue
             length = plain[0] << 8 | plain[1]
             if not 1 <= length <= MAX_FRAME_DATA:
                 self.counts.bad_lengths += 1
-                return self._reject(position)
+                return self._reject()
             if len(plain) == length + 3:
                 frame_data = bytes(plain[2:-1])
                 if checksum(frame_data) != plain[-1]:
                     self.counts.bad_checksums += 1
-                    return self._reject(position)
+                    return self._reject()
                 del self._buffer[:position]
                 self.counts.frames += 1
                 return interpret(frame_data), True
