@@ -89,7 +89,6 @@ class CheckedDecoder(Decoder):
                     track.totals,
                 )
                 for node, track in self.nodes.items()
-                if track.heard
             ],
             self.range_offsets_m,
             len(self.acknowledged),
