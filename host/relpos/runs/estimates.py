@@ -51,6 +51,13 @@ def _one_of(words: type[StrEnum]) -> Parser:
     return parse
 
 
+def _index(text: str) -> int:
+    value = whole(text)
+    if value < 0:
+        raise ValueError("is negative")
+    return value
+
+
 _ESTIMATE_TABLE = (
     Column("time_s", bounded("time_s")),
     Column("node", node_id),
@@ -82,7 +89,7 @@ _PAIR_TABLE = (
 )
 _ALTERNATIVE_TABLE = (
     Column("time_s", bounded("time_s")),
-    Column("alternative", whole),
+    Column("alternative", _index),
     Column("probability", not_negative),
     Column("node", node_id),
     Column("x_m", number),
