@@ -192,6 +192,48 @@ def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
     assert vertical.of(1, 200.0).sigma_z_m < 0.5
 
 
+def _goes_on(vertical: VerticalFilter, node: int, second: int) -> None:
+    """A second on the level, whichever it is."""
+    time_s = float(second)
+    vertical.move(Advance(time_s, node, 1.0, 1.3, 0.0, 0.0, steps=1.8))
+    vertical.measure(Height(time_s, node, 0.02 * (second % 3)), time_s)
+
+
+def test_who_joined_late_stays_where_a_short_range_found_them_whatever_others_show() -> None:
+    vertical, climbed_m = VerticalFilter(), np.clip((np.arange(320) - 30) * 0.28, 0.0, 3.5)
+    for second in range(1, 320):
+        time_s, climbs = float(second), 0.0 < climbed_m[second] < 3.5
+        vertical.move(Advance(time_s, 1, 1.0, 0.9, 0.0, 0.0, steps=1.6 if climbs else 1.8))
+        height_m = round(float(climbed_m[second]), 2) + 0.02 * (second % 3)
+        vertical.measure(Height(time_s, 1, height_m), time_s)
+        for node in (2, 3, 4, *((5,) if second > 100 else ())):
+            _goes_on(vertical, node, second)
+        if second == 200:
+            vertical.ranged(Range(time_s, 1, 5, 1.2))
+        vertical.close(time_s)
+    met, late = vertical.of(1, 319.0), vertical.of(5, 319.0)
+    assert (met.floor, late.floor) == (1, 1)
+    assert abs(late.z_m - met.z_m) < 3.0 * late.sigma_z_m < 2.0
+
+
+def test_who_was_off_for_a_minute_may_have_climbed() -> None:
+    """Its height goes on from the last one; its first report knows next to nothing of its way."""
+    vertical = VerticalFilter()
+    for second in range(1, 220):
+        if second == 121:
+            off = Advance(121.0, 4, 61.0, 0.0, 0.0, 0.0, 1.0, 90.0, 90.0, 4.0, 90.0, 0.0)
+            vertical.move(off)
+        for node in (1, 2, 3, 4):
+            if node < 4 or not 60 < second < 121:
+                _goes_on(vertical, node, second)
+        vertical.close(float(second))
+    back, other = vertical.of(4, 219.0), vertical.of(1, 219.0)
+    assert other.floor == 0
+    assert other.sigma_z_m < 0.3
+    assert back.sigma_z_m > 1.0
+    assert (back.floor_probability or 0.0) < 0.9
+
+
 def test_the_variance_and_the_floor_say_that_a_sensor_died() -> None:
     outcome = follow({1: [stand(300)], 2: [stand(300)]}, silent={2: (40.0, 500.0)})
     before, soon, later = (outcome.told[2][k] for k in (38, 100, 299))

@@ -23,6 +23,7 @@ import numpy as np
 
 from relpos.fusion.arrays import Bools, Complexes, Floats, Indices
 from relpos.fusion.estimator import Episode, Vertical
+from relpos.fusion.models.odometry_faults import vagueness
 from relpos.fusion.models.pressure import FAST_S
 from relpos.fusion.timeline import Advance
 from relpos.fusion.vertical import episodes
@@ -190,6 +191,8 @@ class VerticalFilter:
     _walked: Bools = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     """In the last interval."""
     _settled: Bools = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    _own_zero: Bools = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    """Who joined late or was off: its heights count from where that was, not from the start."""
 
     @property
     def active(self) -> bool:
@@ -200,7 +203,15 @@ class VerticalFilter:
 
     def move(self, step: Advance) -> Advance:
         """Add a piece of motion; return it without what stairs probably add to it."""
-        return self._track(step.node).move(step) if self.active else step
+        if not self.active:
+            return step
+        track, row = self._track(step.node), self._row.get(step.node)
+        off = step.time_s - track.height_s > UNSEEN_S and vagueness(step) is not None
+        if off and row is not None:
+            # It was off, and goes on from its last height, wherever its wearer is now.
+            self._own_zero[row] = True
+            self.heights.doubt(row, UNSEEN_M * math.sqrt(step.duration_s))
+        return track.move(step)
 
     def measure(self, measured: Height, time_s: float) -> bool:
         """Add a reported height, at its time in the order of steps; False from a stuck sensor."""
@@ -241,6 +252,7 @@ class VerticalFilter:
         # Otherwise heights are over a common ground, and it does not start where the others do.
         at_start = not late and abs(track.height_m) <= 1.0
         self._settled = np.append(self._settled, at_start)
+        self._own_zero = np.append(self._own_zero, late)
         self._base = np.append(self._base, 0)
         self._doubt_m = np.append(self._doubt_m, 0.0)
         self._over = Over(
@@ -402,7 +414,8 @@ class VerticalFilter:
         heights, floors = self.heights, self.floors
         bias_m = heights.mean[:, FAST] + heights.mean[:, SLOW]
         slow_m2 = heights.covariance[:, SLOW, SLOW]
-        known = np.where(self._settled & (slow_m2 < VAGUE_M**2), bias_m, np.nan)
+        tells = self._settled & ~self._own_zero & (slow_m2 < VAGUE_M**2)
+        known = np.where(tells, bias_m, np.nan)
         pressed_m, shown = np.zeros(len(bias_m)), np.zeros(len(bias_m), dtype=np.bool_)
         biases_m = known.tolist()
         for row in range(len(bias_m)):
@@ -413,6 +426,8 @@ class VerticalFilter:
                 pressed_m[row] = statistics.median(others)
         # Of the bias, and of a height that is no longer reported.
         over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
+        over_m2 += UNKNOWN_M**2 * self._own_zero
+        shown &= ~self._own_zero
         self._over = Over(heights.over_m - pressed_m, over_m2)
         lost = shown & (np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2))
         self._settled &= ~lost
