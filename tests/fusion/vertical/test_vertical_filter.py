@@ -157,6 +157,13 @@ def test_who_joins_late_is_anywhere() -> None:
     assert outcome.told[1][-1].sigma_z_m < 0.5
 
 
+def _goes_on(vertical: VerticalFilter, node: int, second: int) -> None:
+    """A second on the level, whichever it is."""
+    time_s = float(second)
+    vertical.move(Advance(time_s, node, 1.0, 1.3, 0.0, 0.0, steps=1.8))
+    vertical.measure(Height(time_s, node, 0.02 * (second % 3)), time_s)
+
+
 def test_a_team_that_comes_long_after_its_post_starts_on_the_floor_of_the_start() -> None:
     vertical = VerticalFilter(posts=frozenset({7}))
     for second in range(400):
@@ -164,8 +171,7 @@ def test_a_team_that_comes_long_after_its_post_starts_on_the_floor_of_the_start(
         vertical.measure(Height(time_s, 7, 0.0), time_s)
         for node in (1, 2):
             if second >= 300:
-                vertical.move(Advance(time_s, node, 1.0, 1.3, 0.0, 0.0, steps=1.8))
-                vertical.measure(Height(time_s, node, 0.02 * (second % 3)), time_s)
+                _goes_on(vertical, node, second)
         vertical.close(time_s)
     for node in (1, 2, 7):
         told = vertical.of(node, 399.0)
@@ -190,13 +196,6 @@ def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
     assert vertical.of(2, 200.0).sigma_z_m < 1.0
     assert abs(vertical.of(2, 200.0).z_m - vertical.of(1, 200.0).z_m) < 0.5
     assert vertical.of(1, 200.0).sigma_z_m < 0.5
-
-
-def _goes_on(vertical: VerticalFilter, node: int, second: int) -> None:
-    """A second on the level, whichever it is."""
-    time_s = float(second)
-    vertical.move(Advance(time_s, node, 1.0, 1.3, 0.0, 0.0, steps=1.8))
-    vertical.measure(Height(time_s, node, 0.02 * (second % 3)), time_s)
 
 
 def test_who_joined_late_stays_where_a_short_range_found_them_whatever_others_show() -> None:
