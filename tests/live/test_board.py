@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -85,6 +86,8 @@ def test_an_evacuation_knows_for_each_whether_it_was_shown_and_understood():
         event("rollcall", action="start", nodes=[1], within_s=math.nan),
         event("rollcall", action="start", nodes=[1], within_s="x"),
         event("mayday", node=1, on=False),
+        event("mayday", node=1, on=True, id=""),
+        event("mayday", node=1, on=True, id=["a"]),
         event("evacuate", action="acknowledged", node=1),
         event("evacuate", action="dance"),
     ],
@@ -156,6 +159,17 @@ def test_the_time_of_a_roll_call_may_be_any_numeral(within_s):
     board = Board()
     board.apply(event("rollcall", action="start", nodes=[1], within_s=within_s))
     assert repr(board.roll_call.within_s) == "600.0"
+
+
+def test_a_mayday_that_is_over_does_not_begin_again_by_a_late_copy_of_its_call():
+    board = Board()
+    for call in (event("mayday", node=2, on=True, id="a"), event("mayday", node=2, on=False)):
+        board.apply(call)
+    assert board.apply(event("mayday", node=2, on=True, id="a")) is None
+    assert board.mayday == {}
+    board.apply(event("mayday", node=2, on=True, id="b"))
+    assert list(board.mayday) == [2]
+    json.dumps(board.to_message())
 
 
 def test_the_same_events_give_the_same_board():

@@ -416,6 +416,24 @@ def test_a_mayday_that_is_called_again_leaves_the_answers_of_the_roll_call():
     assert list(phones.board["roll_call"]["answers"]) == [2]
 
 
+def test_a_late_copy_of_a_mayday_that_is_over_calls_the_roll_no_second_time():
+    call = {"node": 1, "on": True, "id": "a"}
+    with EmulatedTeam(TeamConfig("straight", 3, 16.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        phones = Phones(
+            source,
+            (8.0, Request(1, "mayday", 8.0, call)),
+            (10.0, Request(2, "mayday", 10.0, {"node": 1, "on": False})),
+            (11.0, Request(3, "rollcall", 11.0, {"action": "end"})),
+            (12.0, Request(4, "mayday", 12.0, call)),
+        )
+        session, _ = make_session(source, deadreckoning, phones)
+        run_through(session)
+    assert [status for _, _, status in phones.answers] == [200] * 4
+    assert phones.board["mayday"] == {}
+    assert phones.board["roll_call"]["outcome"] == "incomplete"
+
+
 def test_a_mayday_of_somebody_whose_node_is_not_heard_sounds_and_is_shown_until_it_is_over():
     with EmulatedTeam(TeamConfig("straight", 2, 26.0, 3, beacons=True)) as team:
         source = TeamInput(team)

@@ -8,7 +8,7 @@ import threading
 import time
 from typing import Any
 
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 from stage import Stage, wait_for, wait_live
 
 BY_HAND: dict[str, Any] = {
@@ -102,7 +102,13 @@ def test_a_mayday_is_called_until_the_session_has_it_also_by_a_page_that_was_clo
 ) -> None:
     page = wearer(visit("/phone", expect_gone=True, **BY_HAND), "Anna")
     wait_live(page)
-    page.route("**/api/mayday", lambda route: route.abort())
+    calls: list[Any] = []
+
+    def abort(route: Route) -> None:
+        calls.append(route.request.post_data_json)
+        route.abort()
+
+    page.route("**/api/mayday", abort)
     page.evaluate(PRESS)
     words = page.locator("#mayday-words")
     expect(words).to_contain_text("MAYDAY NOT SENT")
@@ -117,6 +123,9 @@ def test_a_mayday_is_called_until_the_session_has_it_also_by_a_page_that_was_clo
     page.reload()
     wait_live(page)
     page.wait_for_timeout(1500)
+    assert not stage.board.mayday
+    # A browser repeats what got no answer; a copy may come when all is over.
+    assert page.request.post(stage.url("/api/mayday"), data=calls[0]).ok
     assert not stage.board.mayday
 
 

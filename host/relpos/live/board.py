@@ -50,7 +50,7 @@ STATE_WORDS = {
 BOARD_EVENTS: Mapping[str, tuple[str, ...]] = {
     "board": ("node", *TEXTS, "state", "air_bar"),
     "rollcall": ("action", "node", "nodes", "answer", "within_s", "emergency"),
-    "mayday": ("node", "on"),
+    "mayday": ("node", "on", "id"),
     "evacuate": ("action", "node", "nodes"),
     "marker": ("action", "id", "sign", "x_m", "y_m", "node"),
     "plan": ("action", "image", "points"),
@@ -148,6 +148,8 @@ class Board:
 
     people: dict[int, Place] = field(default_factory=dict)
     mayday: dict[int, dict[str, Any]] = field(default_factory=dict)
+    calls: set[str] = field(default_factory=set)
+    """The ids of the MAYDAYs that were called: a phone repeats its call until it has an answer."""
     roll_call: RollCall | None = None
     evacuation: Evacuation | None = None
     markers: dict[str, Marker] = field(default_factory=dict)
@@ -157,7 +159,9 @@ class Board:
 
     def to_message(self) -> dict[str, Any]:
         """Return the message ``board`` of the page's protocol."""
-        return {"type": "board", **asdict(self)}
+        message = {"type": "board", **asdict(self)}
+        del message["calls"]
+        return message
 
     @property
     def called_out(self) -> list[int]:
@@ -261,9 +265,7 @@ class Board:
         )
 
     def _marker(self, event: Mapping[str, Any]) -> Said | None:
-        name = event["id"]
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_TEXT or not name.isprintable():
-            raise BoardError(f"id: not 1 to {MAX_TEXT} printable characters")
+        name = _id(event["id"])
         if event.get("action") == "remove":
             if self.markers.pop(name, None) is None:
                 raise BoardError(Said("no-marker", "no such marker"))
@@ -315,8 +317,13 @@ class Board:
             floor=str(floor)
         )
 
-    def _mayday(self, event: Mapping[str, Any]) -> Said:
+    def _mayday(self, event: Mapping[str, Any]) -> Said | None:
         if event.get("on"):
+            if "id" in event:
+                call = _id(event["id"])
+                if call in self.calls:
+                    return None  # On its way for long: it may have been ended meanwhile.
+                self.calls.add(call)
             self.mayday[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
             return Said("mayday-of", "{whom}MAYDAY", whom="")
         if self.mayday.pop(event["node"], None) is None:
@@ -358,6 +365,13 @@ def _nodes(values: Any) -> list[int]:
     if not isinstance(values, list):
         raise BoardError("nodes: not a list")
     return sorted({node for node in values if type(node) is int and 0 < node < 255})
+
+
+def _id(value: Any) -> str:
+    """Return an id that a page made. BoardError."""
+    if not isinstance(value, str) or not 0 < len(value) <= MAX_TEXT or not value.isprintable():
+        raise BoardError(f"id: not 1 to {MAX_TEXT} printable characters")
+    return value
 
 
 def _number(value: Any) -> float:

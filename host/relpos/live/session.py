@@ -512,16 +512,16 @@ class LiveSession:
             if silent or at.status not in (NodeStatus.OK, NodeStatus.STALE):
                 return refusal(Said("where", "where you are is not known yet")), 409
             body |= {"x_m": at.x_m, "y_m": at.y_m}
-        again = kind == "mayday" and body.get("node") in self._board.mayday
+        called = set(self._board.mayday)
         try:
             self._happen({**body, "kind": kind})
         except BoardError as error:
             return refusal(error.args[0]), 400
-        if kind == "mayday" and body.get("on") and not again:
+        if self._board.mayday.keys() - called:
             # Who else is in trouble is asked at once.
             start = {"action": "start", "emergency": True, "within_s": 300.0}
-            called = sorted({*everybody, body["node"]})
-            self._happen({"kind": "rollcall", "by": body["by"], "nodes": called, **start})
+            nodes = sorted({*everybody, body["node"]})
+            self._happen({"kind": "rollcall", "by": body["by"], "nodes": nodes, **start})
         return {"done": True}, 200
 
     def _words(self, kind: str, body: dict[str, Any]) -> str:

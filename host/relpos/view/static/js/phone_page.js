@@ -568,26 +568,27 @@ function showCompass() {
 hold(byId("mayday"), () => {
   if (!me) return open("me");
   // The phone's page may be closed, or its browser end, before the session has it.
-  store.setItem(MAYDAY, JSON.stringify({ node: me.node, by: me.name, unix_ms: Date.now() }));
-  return callMayday(me.node, me.name);
+  const call = { id: randomId(), node: me.node, by: me.name };
+  store.setItem(MAYDAY, JSON.stringify({ ...call, unix_ms: Date.now() }));
+  return callMayday(call);
 });
 
 /** Go on calling a MAYDAY that the session had not when the page was left. */
 function resumeMayday() {
   try {
-    const { node, by, unix_ms: calledMs } = JSON.parse(store.getItem(MAYDAY) ?? "{}");
-    if (Math.abs(Date.now() - calledMs) < MAYDAY_KEPT_MS) callMayday(node, by);
+    const { unix_ms: calledMs, ...call } = JSON.parse(store.getItem(MAYDAY) ?? "{}");
+    if (Math.abs(Date.now() - calledMs) < MAYDAY_KEPT_MS) callMayday(call);
   } catch {
     // Not ours.
   }
 }
 
 /** Called until the session has it: whoever calls may have no hand for a second time. */
-async function callMayday(node, by) {
+async function callMayday(call) {
   clearTimeout(maydayTimer);
   if (byId("mayday-words").textContent === "") setText(byId("mayday-words"), t("mayday.sending"));
   try {
-    await postJson("/api/mayday", { node, on: true, by });
+    await postJson("/api/mayday", { ...call, on: true });
     lastPress = null; // Else its line takes this one's place.
     setText(byId("last"), t("mayday.sent"));
     // The board may have come first, and have told its end as well; or tells its end alone.
@@ -597,9 +598,10 @@ async function callMayday(node, by) {
     }
     store.removeItem(MAYDAY);
   } catch (error) {
-    setText(byId("mayday-words"), maydayHad ? t("mayday.sent") : t("mayday.failed", { error: error.message }));
+    if (store.getItem(MAYDAY) === null) return; // The board had it first.
+    setText(byId("mayday-words"), t("mayday.failed", { error: error.message }));
     if (!error.again) store.removeItem(MAYDAY);
-    else maydayTimer = setTimeout(() => maydayHad || callMayday(node, by), MAYDAY_AGAIN_MS);
+    else maydayTimer = setTimeout(() => store.getItem(MAYDAY) !== null && callMayday(call), MAYDAY_AGAIN_MS);
   }
 }
 byId("marker-place").addEventListener("click", async () => {
