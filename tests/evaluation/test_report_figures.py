@@ -103,6 +103,20 @@ def test_no_line_joins_rows_across_a_gap() -> None:
     assert np.isnan(lines(figure, 1)["node 1"][0]).sum() == 1
 
 
+@pytest.mark.parametrize(("floors_m", "start_m"), [((0.0, 3.5), 7.0), ((), 0.0)])
+def test_true_heights_count_from_where_the_estimated_ones_do(
+    floors_m: tuple[float, ...], start_m: float
+) -> None:
+    # Two floors up from the start on; its truth begins after the first estimate.
+    ways = {1: circle(3.0)}
+    plain = content(ways, {1: Track(TIMES, ways[1].x_m, ways[1].y_m, ways[1].heading_rad)})
+    climbed = replace(ways[1], time_s=TIMES + 0.1, z_m=7.0 + 0.1 * TIMES)
+    told = replace(ways[1], z_m=0.0 * TIMES)
+    run = replace(plain.run, description=Description(floors_m=floors_m))
+    seen = replace(plain, run=run, truth={1: climbed}, guessed={1: told})
+    assert lines(report.draw(seen, "height"), 0)["truth"][1][0] == pytest.approx(start_m)
+
+
 def test_a_node_that_was_not_located_is_no_track() -> None:
     def at(time_s: float, status: NodeStatus) -> Estimate:
         return Estimate(time_s, (NodeEstimate(1, 2.0, 3.0, 0.0, 1, 1, 0, 1, status),), ())

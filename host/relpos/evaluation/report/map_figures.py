@@ -18,7 +18,7 @@ from relpos.evaluation.style import (
     of_node,
 )
 from relpos.fusion.estimator import NodeStatus
-from relpos.tracks import MAX_GAP_S, Track, Tracks, interpolate
+from relpos.tracks import MAX_GAP_S, Track, Tracks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -147,11 +147,12 @@ def _draw_tracks(
 
 
 def heights(content: Content) -> Picture | None:
-    """Draw the height of every node over its own start."""
+    """Draw the height of every node, in a building with floors over the start's floor."""
     known = {n: t for n, t in content.guessed.items() if np.isfinite(t.z_m).any()}
     if not known:
         return None
     places = {node: k for k, node in enumerate(content.nodes)}
+    floors = bool(content.run.description.floors_m)
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -160,9 +161,9 @@ def heights(content: Content) -> Picture | None:
             there = np.isfinite(track.z_m)
             first_s = track.time_s[there][0]
             true = content.truth.get(node)
-            if true is not None and np.isfinite(true.z_m).any():
-                z_m = true.z_m - interpolate(true.time_s, true.z_m, np.array([first_s]))[0]
-                x, y = broken_at_gaps(true.time_s, z_m)
+            if true is not None and (seen := np.isfinite(true.z_m)).any():
+                start_m = np.interp(first_s, true.time_s[seen], true.z_m[seen])
+                x, y = broken_at_gaps(true.time_s, true.z_m - (0.0 if floors else start_m))
                 axes.plot(
                     x, y, color=TRUTH, linewidth=3.5, zorder=1,
                     label="truth" if node == min(known) else None,
@@ -175,7 +176,8 @@ def heights(content: Content) -> Picture | None:
     return Picture(
         "height",
         "Height",
-        "Estimated height of every node over its own start, from pressure.",
+        f"Estimated height of every node over {'the' if floors else 'its own'} start, from "
+        "pressure.",
         f"Height over time of {len(known)} nodes.",
         draw,
         (9.6, 3.2),

@@ -198,7 +198,7 @@ def iso(content: Content) -> Table | None:
         f"node's own start. Relative accuracy ({words}): the vectors between two nodes are off by "
         f"{relative.mean_m:.2f} m on average, {relative.rms_m:.2f} m RMS, {relative.e95_m:.2f} m "
         f"at 95 %. Coverage: a node was located at {100.0 * assessed.coverage:.1f} % of its test "
-        "points. Floor and zone detection need a map and are left out."
+        "points. Zone detection needs a map and is left out."
     )
     if not any(a.vertical.count for a in kinds):
         note += " No height is known in both estimate and truth: no vertical or spherical error."
