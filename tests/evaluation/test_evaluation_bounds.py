@@ -312,6 +312,12 @@ def test_ranges_that_are_sometimes_too_long_carry_less_information() -> None:
     assert late.filtering_distance_m > clean.filtering_distance_m
 
 
+def test_ranges_of_the_laboratory_may_have_no_noise() -> None:
+    bound = bounds.of_simulated("lab", 0, {"sigma_range_m": 0, "seconds": 60})
+    usual = bounds.of_simulated("lab", 0, {"seconds": 60})
+    assert 0.0 < bound.totals().filtering_distance_m < usual.totals().filtering_distance_m
+
+
 def test_hidden_parameters_raise_the_bound() -> None:
     """Scale and drift raise the bound, and are themselves known the better the later."""
     plain = bounds.of_simulated("paper-p1", 2, {"seconds": 200})

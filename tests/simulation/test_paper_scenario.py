@@ -117,6 +117,7 @@ def test_a_wrong_scenario_or_setting_is_named() -> None:
     [
         ({"kidnap_m": "-1"}, "kidnap_m: -1 is not within"),
         ({"kidnap_m": "5", "seconds": "200"}, "kidnap_s: 300 is past the end at 200 s"),
+        ({"motion_period_s": "2", "seconds": "1"}, "motion_period_s: no motion within 1 s"),
         ({"noisy_user": "7"}, "no user 7 of 6"),
         ({"noisy_user": "1.5"}, "not a whole number"),
         ({"noisy_factor": "1000"}, "not within"),

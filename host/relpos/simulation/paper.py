@@ -172,6 +172,8 @@ def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = Non
         raise RelposError(
             f"setting noisy_user: there is no user {settings.noisy_user} of {settings.nodes}"
         )
+    if settings.motion_period_s > settings.seconds:
+        raise RelposError(f"setting motion_period_s: no motion within {settings.seconds:g} s")
     if settings.kidnap_m > 0.0 and settings.kidnap_s >= settings.seconds:
         raise RelposError(
             f"setting kidnap_s: {settings.kidnap_s:g} is past the end at {settings.seconds:g} s"

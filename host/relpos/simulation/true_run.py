@@ -169,7 +169,7 @@ def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> Tru
     moving = np.linalg.norm(np.diff(positions, axis=1), axis=-1) > 0.0
 
     hidden, everyone = run.hidden, np.ones(settings.nodes)
-    clear = 1.0 / settings.sigma_range_m**2
+    clear = _range_information(PaperSettings(sigma_range_m=settings.sigma_range_m))
     delays = (
         settings.wall_delay_max_m - settings.wall_delay_min_m,
         settings.body_delay_max_m - settings.body_delay_min_m,
