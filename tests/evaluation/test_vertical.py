@@ -147,6 +147,12 @@ def test_false_flights_are_counted_over_the_time_that_has_an_estimate() -> None:
     assert scored(stated[:11]).false_flights_h == pytest.approx(3600.0 / 13.0), "and 2 s more"
 
 
+def test_a_flight_that_the_run_ends_in_is_neither_missed_nor_false() -> None:
+    stated = estimates(episode=lambda n, t: "up" if t >= 14.0 else "level")
+    result = scored(stated, marks=[e for e in events() if e.time_s < 20.0])
+    assert (result.flights, result.false_flights_h) == (0, 0.0)
+
+
 def test_the_way_on_flights_is_estimated_over_true() -> None:
     assert scored(estimates()).stairs_way == pytest.approx(1.0)
     assert scored(estimates(stretch=2.0)).stairs_way == pytest.approx(2.0)

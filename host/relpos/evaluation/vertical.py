@@ -119,6 +119,12 @@ class _Node:
     episode: Words
     true_episode: Words
     spans: Sequence[tuple[float, float, str]]
+    """Begin, end and word of each true episode; the last ends with the run, at infinity."""
+
+    @property
+    def ended(self) -> list[tuple[float, float, str]]:
+        """The spans that end before the run does: of the last nobody knows how it goes on."""
+        return [span for span in self.spans if math.isfinite(span[1])]
 
     @property
     def error_m(self) -> Floats:
@@ -228,8 +234,7 @@ def _true_episodes(own: Sequence[tuple[float, str]], at_s: Floats) -> Words:
 
 
 def _spans(own: Sequence[tuple[float, str]]) -> list[tuple[float, float, str]]:
-    """Return begin, end and word of each true episode that ends before the run does."""
-    return [(begin_s, end_s, word) for (begin_s, word), (end_s, _) in pairwise(own)]
+    return [(begin_s, end_s, w) for (begin_s, w), (end_s, _) in pairwise([*own, (math.inf, "")])]
 
 
 def _shifted(nodes: Mapping[int, _Node]) -> dict[int, _Node]:
@@ -310,7 +315,7 @@ def _with_flights(found: Vertical, nodes: Mapping[int, _Node], *, stated: bool) 
     falls = [math.nan]
     for n in nodes.values():
         hours += np.isfinite(n.sigma_z_m).sum() / 3600.0
-        for begin_s, end_s, word in n.spans:
+        for begin_s, end_s, word in n.ended:
             inside = (n.time_s >= begin_s) & (n.time_s <= end_s + LAG_S)
             hit = int(((n.episode == word) & inside).sum()) >= FOUND_S
             if word in FLIGHTS:
@@ -366,7 +371,7 @@ def _way_on_flights(n: _Node) -> tuple[float, float]:
     known = np.isfinite(ahead[0]) & np.isfinite(ahead[1]) & (np.diff(n.time_s) <= 1.0)
     inside_s, lagged = np.zeros(known.size), np.zeros(known.size, dtype=bool)
     from_s, until_s = n.time_s[:-1], n.time_s[1:]
-    for begin_s, end_s, word in n.spans:
+    for begin_s, end_s, word in n.ended:
         if word in FLIGHTS:
             inside_s += np.clip(np.minimum(until_s, end_s) - np.maximum(from_s, begin_s), 0.0, 1.0)
             lagged |= (until_s > begin_s) & (from_s < end_s + LAG_S)
