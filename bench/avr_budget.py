@@ -215,7 +215,11 @@ def plan_table(cost: Cost) -> Table:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print, and return the exit status."""
-    parser = argparse.ArgumentParser(prog="python bench/avr_budget.py", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python bench/avr_budget.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--board", action="append", choices=sorted(BUDGETS), help="default: all")
     parser.add_argument(
         "--seconds", type=float, default=60.0, help="length of the walk (default 60)"

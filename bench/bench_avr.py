@@ -1,10 +1,13 @@
 """Simulated boards against real time: one Uno, one Mega, and six Unos on all cores.
 
+    python bench/bench_avr.py
+
 Each runs the whole firmware in normal service, chip models included. Needs `make firmware`.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -28,6 +31,7 @@ def simulate(board: str, seed: int) -> float:
 
 def main() -> int:
     """Print one line a case."""
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
     try:
         for board in BOARDS:
             print(f"one {board}: {SECONDS / simulate(board, 1):.1f} times real time")

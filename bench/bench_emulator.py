@@ -82,7 +82,9 @@ def measure_chain(board: str, nodes: int, seconds: float, scenario: str, seed: i
 
 def main() -> None:
     """Read the arguments, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--board", choices=[str(kind) for kind in BoardKind])
     parser.add_argument("--nodes", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=120.0)

@@ -118,7 +118,9 @@ def add(run: Run, ours: Figures, barometer: Figures) -> None:
 
 def main() -> None:
     """Print a table of both sets."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="with both sets in it")
     folder = parser.parse_args().folder
     names = ("height_phone_museum", "height_phone_hamburg")

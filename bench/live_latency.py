@@ -170,7 +170,9 @@ def percentile(values: Sequence[float], share: float) -> float:
 
 def main() -> int:
     """Run it; 1 where a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--estimator", default="bank")

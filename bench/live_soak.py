@@ -96,7 +96,9 @@ def view_of(pid: int) -> int | None:
 
 def main() -> int:
     """Run it; 1 where something grows."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", type=float, default=2.0, help="of the team's time")
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--speed", type=float, default=1.0)

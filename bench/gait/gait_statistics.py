@@ -6,6 +6,7 @@ DATA is the folder of recordings, by default RELPOS_DATA or ../shared/data.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import math
 import sys
@@ -268,9 +269,11 @@ def print_statistics(title: str, walks: list[GaitStatistics]) -> None:
         print(f"  {name:22s} " + row(mean(name)))
 
 
-def main(arguments: list[str]) -> int:
+def main() -> int:
     """Print simulated and recorded walks side by side."""
-    folder = Path(arguments[0]) if arguments else DATA
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", nargs="?", type=Path, default=DATA)
+    folder: Path = parser.parse_args().data
     if not folder.is_dir():
         print("no recordings: give their folder, or set RELPOS_DATA", file=sys.stderr)
         return 1
@@ -292,4 +295,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main())

@@ -7,6 +7,7 @@ late and with the noise of a tag's.
 
 from __future__ import annotations
 
+import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,6 +55,7 @@ def errors(data: Path, person: str, rng: np.random.Generator) -> tuple[float, fl
 
 def main() -> None:
     """Print a line a person and the mean."""
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
     data, rng = replay.DATA / "stairs_mocap_virtual", np.random.default_rng(0)
     people = sorted({folder.name.partition("Treppe")[0] for folder in data.iterdir()})
     found = 100.0 * np.array([errors(data, person, rng) for person in people])
