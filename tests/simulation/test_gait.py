@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from relpos.errors import DataError
 from relpos.simulation.gait import pendulum_rise_m
 from relpos.simulation.spectral import Spectral
-from relpos.simulation.team import MAX_WALKERS, SCENARIOS, make_team
+from relpos.simulation.team import MAX_WALKERS, make_team
 from relpos.simulation.torso import vertical_shape
 from relpos.simulation.walker import Route, WalkerTruth
 from relpos.simulation.world import GRAVITY_M_S2
@@ -116,19 +115,6 @@ def test_the_lab_walk_covers_its_distance_in_its_time() -> None:
     assert world.size_m == (25.0, 15.0)
     for walker in team:
         assert 290.0 < walker.steps.length_m.sum() < 313.0
-
-
-def test_a_common_start_heading_is_given_up_for_the_route() -> None:
-    scenario = replace(SCENARIOS["paper"], start_heading_spread_rad=math.pi)
-    team, _ = make_team(scenario, 3, 60.0, SEED)
-    away = [w.heading_rad[: 2 * 200].mean() for w in team]
-    assert max(abs(a) for a in away) > 0.5
-    for walker in team:
-        if walker.walk_start_s < 50:
-            under_way = (walker.time_s > walker.walk_start_s + 1) & (
-                walker.time_s < walker.walk_start_s + 6
-            )
-            assert abs(walker.heading_rad[under_way].mean()) < 0.1
 
 
 @pytest.mark.parametrize("nodes", [1, MAX_WALKERS])

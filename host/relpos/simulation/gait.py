@@ -178,17 +178,12 @@ def walk(
     plan: Plan,
     grid: Grid,
     world: World,
-    start_heading_rad: float | None,
 ) -> WalkerTruth:
-    """Synthesise the truth of one walker. ``start_heading_rad`` is None for along the first leg."""
+    """Synthesise the truth of one walker, who stands facing along the first leg."""
     t, spectral = grid.time_s, grid.spectral
     progress = _progress(plan, grid)
     track = _track(rng, route, progress.path_m)
     roll, pitch, yaw = _angles(rng, person, route, progress, track, t)
-    if start_heading_rad is not None:
-        since = np.clip((t - (plan.walk_start_s - 2.5)) / 2.0, 0.0, 1.0)
-        turned = since**3 * (10 - 15 * since + 6 * since**2)
-        yaw += (start_heading_rad - track.bearing_rad[0]) * (1.0 - turned)
     sway = quiet_sway(rng, t, person.sway_scale)
     sway.tilt(roll, pitch, person.sensor_height_m)
 

@@ -1,7 +1,6 @@
 """Teams: who walks where in which scenario.
 
-`make_team` is the one entry: the emulator samples what it returns, the fast simulation and the
-evaluation read the same truth.
+`make_team` is the one entry: the emulator's chips sample what it returns.
 """
 
 from __future__ import annotations
@@ -42,8 +41,6 @@ class Scenario:
     pause_every_s: float = 0.0
     """Mean time between brief pauses; 0 for none."""
     distance_limit_m: float | None = None
-    start_heading_spread_rad: float = 0.0
-    """0: all face along the first leg; else uniform within plus or minus this."""
     mount_sd_rad: float = math.radians(3.0)
     world: World = field(default_factory=World)
     air: Mapping[str, float] | None = None
@@ -142,8 +139,6 @@ def make_team(
         # One stream a place: more walkers in the team do not change those before them.
         rng = np.random.default_rng([seed, place])
         person = make_person(rng, scenario.speed_m_s, scenario.mount_sd_rad)
-        spread = scenario.start_heading_spread_rad
-        heading = float(rng.uniform(-spread, spread)) if spread > 0 else None
         route = Route(corners, person.turn_length_m)
         plan_rng, walk_rng = rng.spawn(2)
         plan = make_plan(
@@ -156,7 +151,7 @@ def make_team(
             scenario.distance_limit_m,
             _stairs(route, scenario),
         )
-        team.append(walk(walk_rng, node, person, route, plan, grid, world, heading))
+        team.append(walk(walk_rng, node, person, route, plan, grid, world))
         start_s += scenario.spacing_m / person.speed_m_s
     if scenario.air is not None:
         team = in_air(team, dict(scenario.air), seed)

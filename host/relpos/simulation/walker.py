@@ -204,10 +204,10 @@ class Route:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Steps as decided: knots of step phase and path length over time, and when feet come down.
+    """Steps as decided: knots of step phase, path length and ground over time.
 
     The phase grows by one a step and is an integer in the middle of double support; between knots
-    both go on steadily, standing where neither changes. ``contact_*`` belong to heel strikes.
+    all go on steadily, standing where none changes.
     """
 
     knot_time_s: FloatArray

@@ -1,6 +1,6 @@
 """The world that walkers share: UWB ranging, radio, magnetic field and air pressure.
 
-First version, without walls: whether two tags hear each other depends on their distance alone.
+Walls are not in it: whether two tags hear each other depends on their distance and on slabs.
 Nothing here is read by an estimator, and nothing here knows firmware or chips.
 """
 
@@ -36,7 +36,6 @@ class UwbChannel:
     detection_near: float = 0.95
     detection_far: float = 0.5
     noise_sigma_m: float = 0.1
-    bias_m: float = 0.0
     nlos_probability: float = 0.0
     nlos_bias_m: tuple[float, float] = (0.5, 2.0)
 
@@ -66,7 +65,7 @@ class UwbChannel:
         )
         if detected >= self.detection_probability(distance_m * 10.0 ** (loss_db / 20.0)):
             return None
-        measured = distance_m + self.bias_m + self.noise_sigma_m * normal
+        measured = distance_m + self.noise_sigma_m * normal
         if blocked < self.nlos_probability:
             low, high = self.nlos_bias_m
             measured += low + (high - low) * excess
