@@ -126,6 +126,8 @@ def main() -> None:
             overrides = dict(row.overrides)
             if given.seconds is not None:
                 overrides["seconds"] = given.seconds
+                if "kidnap_m" in overrides:
+                    overrides["kidnap_s"] = min(300.0, 0.5 * given.seconds)
             case = study.Case(row.label, row.scenario, overrides, given.estimator, settings)
             [outcome] = study.run([case], seeds, pool)
             [bound] = study.bounds_of([case], seeds, pool)
