@@ -163,7 +163,10 @@ def report(
 
 
 def bound(run: Run) -> Bound | None:
-    """Compute the Cramer-Rao bound of a simulated run with known starts, over time; else None."""
+    """Compute the Cramer-Rao bound of a simulated run with known starts, over time; else None.
+
+    None of more than 50 people, too: it would take minutes and gigabytes.
+    """
     from relpos.evaluation import scoring
 
     _check_run(run)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 import scipy
 
+import relpos
 from relpos.evaluation import bounds
 from relpos.simulation import true_run
 from relpos.simulation.paper import settings_of, simulate_paper
@@ -316,6 +317,12 @@ def test_ranges_of_the_laboratory_may_have_no_noise() -> None:
     bound = bounds.of_simulated("lab", 0, {"sigma_range_m": 0, "seconds": 60})
     usual = bounds.of_simulated("lab", 0, {"seconds": 60})
     assert 0.0 < bound.totals().filtering_distance_m < usual.totals().filtering_distance_m
+
+
+@pytest.mark.parametrize(("nodes", "has_one"), [(50, True), (51, False)])
+def test_a_crowd_has_no_bound_beside_its_score(nodes: int, has_one: bool) -> None:
+    run = relpos.simulate("paper", nodes=nodes, seconds=3)
+    assert (relpos.bound(run) is not None) == has_one
 
 
 def test_hidden_parameters_raise_the_bound() -> None:

@@ -154,13 +154,18 @@ def _common(run: Run, priors: Sequence[Prior]) -> bool:
     return not run.truth or given != run.priors_for(InitialPose.FROM_TRUTH)
 
 
+MOST_BOUNDED = 50
+"""Of more people the bound takes minutes and gigabytes: 30 s of a hundred half a minute."""
+
+
 def bound_of(run: Run) -> Bound | None:
     """Compute the Cramer-Rao bound of a simulated run; None for other runs.
 
-    None where a start is unknown: the first errors may then be as large as one likes.
+    None where a start is unknown: the first errors may then be as large as one likes. And None of
+    more than ``MOST_BOUNDED`` people.
     """
     made = run.description.simulated
-    if made is None:
+    if made is None or len(run.priors) > MOST_BOUNDED:
         return None
     # Not for what was recorded: the simulations take half a second to import.
     from relpos.evaluation import bounds
