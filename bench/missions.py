@@ -44,12 +44,12 @@ from relpos.measurements import Prior
 from relpos.simulation import missions
 
 TOLD = {"ekf": f"{__file__}:PlainEkf", "exact": f"{__file__}:ExactFilter"}
-"""Estimators that are told the true noise."""
+"""Estimators that are told the noise of ``base``, which few conditions change."""
 PARTICLES = 20_000
 
 
 class JointEkf:
-    """One extended Kalman filter of all poses, told the true noise; no gate, no constants.
+    """One extended Kalman filter of all poses, told the noise of ``base``; no gate, no constants.
 
     State (3 N,): x, y (m), heading (rad) of each node.
     """
@@ -146,7 +146,7 @@ class JointEkf:
 
 
 class JointParticles(JointEkf):
-    """Two users' poses as particles, told the true noise: near their exact posterior."""
+    """Two users' poses as particles, told the noise of ``base``: near their exact posterior."""
 
     def __init__(self, priors: Sequence[Prior]) -> None:
         super().__init__(priors)

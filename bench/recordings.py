@@ -88,11 +88,10 @@ def score(
     ]
     kept = [e for e in estimates if e.time_s >= after_s]
     m = metrics.of_estimates(kept, run.truth)
-    figures = (
-        m.relative_distance_rmse_m, m.relative_position_rmse_m, m.body_frame_rmse_m, m.nees_distance
+    return (
+        m.relative_distance_rmse_m, m.relative_position_rmse_m, m.body_frame_rmse_m,
+        m.nees_distance, max(vague, default=0.0),
     )  # fmt: skip
-    a, b, c, d = (np.nan if x is None else x for x in figures)
-    return a, b, c, d, max(vague, default=0.0)
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
     python bench/ranging/height.py [--climbers 6] [--seed 1]
 
 Everybody stands, climbs three flights of 18 steps, comes down one and stands again. The pieces'
-pressure sensors are as in docs/emulator.md. docs/building.md has the table.
+pressure sensors are as in docs/emulator.md.
 """
 
 from __future__ import annotations
