@@ -65,7 +65,7 @@ class PaperSettings:
     width_m: float = setting(10.0, "short side of the rectangle", 0.1, 1e4)
     speed_m_s: float = setting(0.5, "walking speed", 0.01, 100.0)
     spacing_s: float = setting(16.0, "time between the starts of two", 0.0, 1e5)
-    motion_period_s: float = setting(1.0, "time between motions", 0.01, 60.0)
+    motion_period_s: float = setting(1.0, "time between motions; each has noise", 0.01, 60.0)
     range_period_s: float = setting(2.0, "time between ranges of a pair", 0.01, 60.0)
     distance_noise_scale: float = setting(1.0, "factor on the noise of step lengths", 0.0, 1e6)
     turn_noise: float = setting(0.18, "relative error of a turn, mean of the six", 0.0, 1e6)
