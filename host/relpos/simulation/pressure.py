@@ -115,7 +115,7 @@ def field_pa(
 def doors_pa(settings: AirSettings, time_s: Floats, rng: np.random.Generator) -> Floats:
     """Pressure (T,) behind doors that shut one node off for a while."""
     field = np.zeros(time_s.size)
-    count = int(rng.poisson(time_s[-1] / DOOR_EVERY_S)) if time_s.size else 0
+    count = int(rng.poisson(time_s[-1] / DOOR_EVERY_S))
     begins_s = rng.uniform(0.0, time_s[-1], count)
     for begin_s, shut_s, sign in zip(
         begins_s, rng.uniform(*DOOR_SHUT_S, count), rng.choice([-1.0, 1.0], count), strict=True

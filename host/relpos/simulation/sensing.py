@@ -191,10 +191,10 @@ def ranges(
     """Every pair's ranges."""
     made: list[Range] = []
     middle_s = 0.5 * settings.seconds
-    count = len(truth.position_m)
-    pairs = [(a, b) for a in range(count) for b in range(a + 1, count)]
+    people = len(truth.position_m)
+    pairs = [(a, b) for a in range(people) for b in range(a + 1, people)]
     *each, own = rng.spawn(len(pairs) + 1)
-    delay_m = settings.delay_m * own.standard_normal(count)
+    delay_m = settings.delay_m * own.standard_normal(people)
     for (a, b), one in zip(pairs, each, strict=True):
         count = one.poisson(settings.range_rate_hz * settings.seconds)
         time_s = np.sort(one.uniform(0.0, settings.seconds, count))

@@ -123,12 +123,6 @@ def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
         row, when = hidden.kidnapped_node - 1, int(np.searchsorted(times, settings.kidnap_s - 1e-9))
         positions[row] = [(t.x_m, t.y_m) for t in run.truth if t.node == hidden.kidnapped_node]
         sigma_m[row, max(when, 1) - 1] = settings.kidnap_m / math.sqrt(2.0)
-
-    drifts = settings.heading_drift_deg_s > 0.0
-    if drifts and not settings.drift_while_waiting:
-        duration_s = np.diff(times) * moving
-    else:
-        duration_s = np.diff(times) * np.ones(moving.shape)
     position_known = settings.start in (Start.KNOWN, Start.POSITION)
     heading_known = settings.start in (Start.KNOWN, Start.HEADING)
     kept = [m for m in run.measurements if isinstance(m, Range) and 0.0 < m.time_s <= times[-1]]
@@ -149,7 +143,7 @@ def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
         drift_rad_s=everyone * math.radians(settings.heading_drift_deg_s),
         log_scale=everyone * settings.scale_error,
         walked_m=chord,
-        drifting_s=duration_s,
+        drifting_s=np.diff(times) * (moving | bool(settings.drift_while_waiting)),
     )
 
 

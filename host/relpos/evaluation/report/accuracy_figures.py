@@ -11,7 +11,15 @@ from relpos.evaluation import ranging
 from relpos.evaluation.iso18305 import Frame
 from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.report.content import Content
-from relpos.evaluation.report.drawing import Picture, broken_at_gaps, dots, grid
+from relpos.evaluation.report.drawing import (
+    MOST_PANELS,
+    Picture,
+    broken_at_gaps,
+    dots,
+    flat_distance,
+    grid,
+    logarithmic,
+)
 from relpos.evaluation.style import (
     COLOURS,
     DASHES,
@@ -26,7 +34,6 @@ from relpos.tracks import whole_seconds
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-from relpos.evaluation.report.drawing import MOST_PANELS, flat_distance, logarithmic
 
 
 def error_over_time(content: Content) -> Picture | None:

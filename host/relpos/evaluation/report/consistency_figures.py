@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation.report.content import Content
-from relpos.evaluation.report.drawing import Picture, broken_at_gaps
+from relpos.evaluation.report.drawing import Picture, broken_at_gaps, flat_distance, logarithmic
 from relpos.evaluation.style import (
     BAD,
     COLOURS,
@@ -26,7 +26,6 @@ from relpos.tracks import interpolate, whole_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-from relpos.evaluation.report.drawing import flat_distance, logarithmic
 
 Floats = npt.NDArray[np.float64]
 
