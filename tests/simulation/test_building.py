@@ -178,6 +178,19 @@ def test_whoever_is_to_fall_falls_also_after_the_last_change_of_floors(fall_s: f
     assert fall_s < begin_s < fall_s + 90.0
 
 
+@pytest.mark.parametrize(
+    ("seed", "changes"),
+    [
+        (3, {"lift_share": 1, "late_s": 60}),  # is on the floor that the first ride leads to
+        (11, {"lift_share": 1, "fall_s": 50, "storeys": 2}),  # lies on the top floor
+    ],
+)
+def test_no_lift_takes_who_is_there_already_or_lies(seed: int, changes: dict[str, float]) -> None:
+    settings = {"seconds": 400, "nodes": 2, "crew": 1, **changes}
+    run = building.simulate_building("building", seed, settings)
+    assert {row.node for row in run.truth} == {1, 2}
+
+
 @pytest.mark.parametrize("fault", ["lost_s", "reboot_s", "carried_s"])
 def test_steps_go_with_the_way_that_they_make_up(fault: str) -> None:
     run = made("calm", seconds=120.0, **{fault: 20.0})

@@ -219,6 +219,8 @@ class Climber:
         if self.floor == len(self.building.floors_m) - 1:
             self.take_stairs(well, self.floor - 1)
         self.walk(well.door_m, 0.3)
+        if self.over:
+            return
         self.place = well.place
         for leg in well.up(self._storey_m(1)):
             self._pass(leg)
@@ -253,10 +255,12 @@ class Climber:
         for change in plan:
             self._wander(min(change.leave_s, fall_s))
             if self.now_s >= fall_s:
-                self.fall()
+                break
+            if change.target == self.floor:
+                continue
             if change.ride:
                 self.ride(change.target)
-            elif change.target != self.floor:
+            else:
                 self.take_stairs(self.building.stairwells[change.well], change.target)
         self._wander(fall_s)
         if not self.over:
