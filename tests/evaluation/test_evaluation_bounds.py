@@ -313,6 +313,16 @@ def test_ranges_that_are_sometimes_too_long_carry_less_information() -> None:
     assert late.filtering_distance_m > clean.filtering_distance_m
 
 
+def test_ranges_that_are_too_long_by_one_length_tell_as_much_as_others() -> None:
+    same = {"nlos_probability": 0.3, "nlos_min_m": 2, "nlos_max_m": 2, "sigma_range_m": 0.1}
+    assert true_run._range_information(settings_of("paper", same)) == pytest.approx(100.0, rel=1e-3)
+
+
+def test_ranges_without_noise_need_no_gigabytes_of_points() -> None:
+    exact = settings_of("paper", {"sigma_range_m": 0, "nlos_probability": 0.5})
+    assert 1e7 < true_run._range_information(exact) < 1e12
+
+
 def test_ranges_of_the_laboratory_may_have_no_noise() -> None:
     bound = bounds.of_simulated("lab", 0, {"sigma_range_m": 0, "seconds": 60})
     usual = bounds.of_simulated("lab", 0, {"seconds": 60})

@@ -196,6 +196,10 @@ def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> Tru
     )
 
 
+_FINEST = 1e5
+"""Sigmas that the largest excess may be long: finer ones need gigabytes of points."""
+
+
 def _range_information(settings: PaperSettings) -> float:
     """Fisher information of one range about its distance, 1/m^2.
 
@@ -209,6 +213,7 @@ def _range_information(settings: PaperSettings) -> float:
     low, high = settings.nlos_min_m, settings.nlos_max_m
     if share <= 0.0:
         return 1.0 / sigma**2
+    sigma = max(sigma, high / _FINEST)
     high = max(high, low + 1e-3 * sigma)
     error = np.arange(-8.0 * sigma, high + 8.0 * sigma, sigma / 50.0)
 
@@ -216,7 +221,9 @@ def _range_information(settings: PaperSettings) -> float:
         density: Floats = np.exp(-0.5 * (x / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
         return density
 
-    excess = (ndtr((error - low) / sigma) - ndtr((error - high) / sigma)) / (high - low)
+    # From the nearer tail: where both are next to 1 their difference would be lost.
+    tail = np.where(error < 0.5 * (low + high), 1.0, -1.0) / sigma
+    excess = np.abs(ndtr(tail * (error - low)) - ndtr(tail * (error - high))) / (high - low)
     excess_slope = (normal(error - low) - normal(error - high)) / (high - low)
     density = (1.0 - share) * normal(error) + share * excess
     slope = -(1.0 - share) * error / sigma**2 * normal(error) + share * excess_slope
