@@ -136,9 +136,22 @@ TEST(another_chip_at_the_address_is_not_set_up) {
   chips.inertial[0x75] = 0x71;  // an MPU-9250
   Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
-  CHECK(!ready(imu, chips, &now_us, 3000000));
-  CHECK(!imu.running());
-  CHECK_EQUAL(0x40, chips.inertial[0x6B]);
+  while (now_us < 3000000) {
+    CHECK(!ready(imu, chips, &now_us, 1));
+    CHECK(!imu.running());
+    CHECK_EQUAL(0x40, chips.inertial[0x6B]);
+  }
+  CHECK_EQUAL(3, chips.transactions);  // once a second
+}
+
+TEST(a_sample_from_before_the_set_up_is_not_announced) {
+  Chips chips;
+  Mpu9150 imu = Mpu9150();
+  const int16_t raw[7] = {};
+  chips.sample(raw);  // at another range
+  uint32_t now_us = 0;
+  set_up(imu, chips, &now_us);
+  CHECK(!ready(imu, chips, &now_us, 60000));
 }
 
 TEST(a_chip_that_fell_asleep_is_set_up_anew) {
@@ -163,6 +176,8 @@ TEST(a_stuck_bus_is_asked_rarely_and_counted) {
   set_up(imu, chips, &now_us);
   chips.stuck = true;
   const uint16_t before = chips.transactions;
+  CHECK(!ready(imu, chips, &now_us, 150000));
+  CHECK(imu.running());
   CHECK(!ready(imu, chips, &now_us, 10000000));
   CHECK(chips.transactions - before <= 35 + 10);  // 0.175 s, then once a second
   CHECK(chips.bus_errors() >= chips.transactions - before);
@@ -206,9 +221,9 @@ TEST(a_sample_from_a_chip_that_is_not_set_up_as_it_was_is_not_used) {
   Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   set_up(imu, chips, &now_us);
-  const int16_t raw[7] = {100, 200, 8192, 0, 1, 2, 3};
   float force[3], rate[3];
   for (uint8_t reg = 0x37; reg <= 0x38; ++reg) {
+    const int16_t raw[7] = {reg, 200, 8192, 0, 1, 2, 3};
     const uint8_t was = chips.inertial[reg];
     chips.inertial[reg] = reg == 0x37 ? 0x00 : 0xFF;
     chips.sample(raw);
@@ -221,14 +236,20 @@ TEST(a_sample_from_a_chip_that_is_not_set_up_as_it_was_is_not_used) {
 TEST(a_loose_contact_that_spoils_every_third_transaction_stops_neither_set_up_nor_samples) {
   Chips chips;
   Mpu9150 imu = Mpu9150();
-  chips.loose = 3;
   uint32_t now_us = 0;
+  set_up(imu, chips, &now_us);
+  chips.stuck = true;  // before
+  while (imu.running()) ready(imu, chips, &now_us, 1);
+  chips.stuck = false;
+  chips.loose = 3;
+  const uint32_t start_us = now_us;
   for (uint8_t i = 0; i < 40 && !imu.running(); ++i) {
     uint32_t wait_us = 0;
     imu.step(chips, now_us, &wait_us);
     now_us += wait_us;
   }
   CHECK(imu.running());
+  CHECK(now_us - start_us < 2500000);  // one attempt that fails costs a second
   uint8_t samples = 0;
   for (int16_t i = 0; i < 100; ++i) {
     const int16_t raw[7] = {i, 200, 8192, 0, 1, 2, 3};
@@ -309,8 +330,39 @@ TEST(a_measurement_that_is_not_ready_gives_no_field) {
   put_field(chips, 1, 1, 1);
   chips.field[0x02] = 0;
   float field[3];
+  const uint16_t before = chips.transactions;
   CHECK_EQUAL(0, fields_in(compass, chips, 50, field));
   CHECK(compass.rejected() > 0);
+  CHECK(chips.transactions - before <= 2 * 5);  // asked no more often for that
+}
+
+TEST(a_magnetometer_is_one_by_its_identity_and_missing_where_three_in_a_row_fail) {
+  Chips chips;
+  Ak8975 compass = Ak8975();
+  float field[3];
+  chips.field[0x00] = 0x49;
+  find(compass, chips);
+  CHECK(!compass.running());
+  chips.field[0x00] = 0x48;
+  put_field(chips, 100, 1, 1);
+  CHECK(fields_in(compass, chips, 60, field) > 0);
+  for (uint8_t round = 0; round < 2; ++round) {  // two fail, one comes, two fail
+    chips.inertial[0x37] = 0x00;
+    fields_in(compass, chips, 20, field);
+    chips.inertial[0x37] = 0x02;
+    put_field(chips, 1 + round, 1, 1);
+    CHECK(fields_in(compass, chips, 12, field) > 0);
+  }
+  CHECK(compass.running());
+  chips.inertial[0x37] = 0x00;
+  fields_in(compass, chips, 40, field);
+  CHECK(!compass.running());
+  chips.inertial[0x37] = 0x02;
+  fields_in(compass, chips, 60, field);
+  CHECK(compass.running());
+  chips.inertial[0x37] = 0x00;
+  fields_in(compass, chips, 15, field);  // and none of before counts
+  CHECK(compass.running());
 }
 
 TEST(without_the_bypass_the_magnetometer_is_missing_and_is_found_when_it_opens) {

@@ -34,6 +34,7 @@ struct World : FakeBoard {
   uint8_t eeprom[relpos::kStorageBytes];
   uint16_t writes[relpos::kStorageBytes] = {};
   bool inertial_present = true;
+  bool samples = true;  // comes with news
   bool walking = false;
   bool tag_present = true;
   bool magnetometer_present = false;
@@ -43,6 +44,8 @@ struct World : FakeBoard {
   uint8_t line_bytes = 255;  // a poll
   uint32_t restarts = 0;
   uint32_t marks = 0;
+  uint16_t pressures = 0;  // that were read
+  uint8_t written = 0;     // most bytes in a transaction's first part
   uint16_t supply = 5000;
   uint16_t flashes = 0;
   uint32_t lit_us = 0;
@@ -130,6 +133,11 @@ struct World : FakeBoard {
   uint32_t exchange_at_us[64] = {};    // since exchanges was cleared
   uint8_t exchanges = 0;
   uint32_t pressure_mpa = 101325000;
+  int16_t force = 8192;     // along x, of the sensor's counts
+  int16_t rate = 0;         // about z
+  uint8_t field = 100;      // the die's x, the accelerometer's y: 30 uT
+  bool field_fails = false;
+  int8_t signal_dbm = -80;
   uint8_t to = kId;  // the node that is meant
 
   uint32_t storage_us = 0;  // a byte takes
@@ -160,10 +168,11 @@ struct World : FakeBoard {
                          const uint8_t* second, uint8_t second_count, uint8_t* read,
                          uint8_t read_count) override {
     now += bus_us;
+    if (first_count > written) written = first_count;
     for (uint8_t i = 0; i < read_count; ++i) read[i] = 0;
     if (address == 0x68 && inertial_present) {
       if (first_count == 1 && first[0] == 0x75) read[0] = 0x68;
-      if (first_count == 1 && first[0] == 0x3A && now - start - sampled_us_ >= 20000) {
+      if (first_count == 1 && first[0] == 0x3A && samples && now - start - sampled_us_ >= 20000) {
         sampled_us_ = now - start;
         read[0] = 1;
       }
@@ -171,19 +180,21 @@ struct World : FakeBoard {
         read[0] = 0x22;
         read[1] = 0x01;
         const int16_t up = static_cast<int16_t>(
-            8192 + (walking ? 2500.0 * sin(12.0 * 1e-6 * (now - start)) : 0.0));
+            force + (walking ? 2500.0 * sin(12.0 * 1e-6 * (now - start)) : 0.0));
         read[4] = static_cast<uint8_t>(up >> 8);  // 1 g along x
         read[5] = static_cast<uint8_t>(up);
         read[7] = ++noise_ & 1;  // along y: no sample is quite the one before
+        read[16] = static_cast<uint8_t>(rate >> 8);
+        read[17] = static_cast<uint8_t>(rate);
       }
       return BusStatus::kOk;
     }
-    if (address == 0x0C && magnetometer_present) {
+    if (address == 0x0C && magnetometer_present && !field_fails) {
       if (read_count == 1) read[0] = 0x48;
       if (read_count == 3) read[0] = read[1] = read[2] = 128;
       if (read_count == 8) {
         read[0] = 1;
-        read[1] = 100;                 // the die's x, the accelerometer's y: 30 uT
+        read[1] = field;
         read[3] = ++field_noise_ & 1;  // no reading is quite the one before
       }
       return BusStatus::kOk;
@@ -193,7 +204,11 @@ struct World : FakeBoard {
       if (first_count == 1 && first[0] == 0x05 && now - exchanged_us_ >= exchange_us) read[0] = 0x10;
       if (first_count == 1 && first[0] == 0x1A && read_count == 2) read[0] = tag_id_;
       if (first_count == 1 && first[0] == 0x1A && second_count == 2) tag_id_ = second[0];
-      if (first_count == 1 && first[0] == 0x50) memcpy(read, &pressure_mpa, sizeof pressure_mpa);
+      if (first_count == 1 && first[0] == 0x50) {
+        memcpy(read, &pressure_mpa, sizeof pressure_mpa);
+        ++pressures;
+      }
+      if (first_count == 3 && first[2] != 0) return BusStatus::kDataNack;  // no peer beyond 255
       if (first_count == 3) read[0] = 1;
       if (first_count == 3 && first[0] == 0xB5) {
         exchanged_us_ = now;
@@ -202,7 +217,7 @@ struct World : FakeBoard {
       if (first_count == 3 && first[0] == 0xC7) {
         const uint32_t row[2] = {(now - start) / 1000, 1000u * first[1]};
         memcpy(read + 1, row, sizeof row);
-        read[9] = 0xB0;  // -80 dBm
+        read[9] = static_cast<uint8_t>(signal_dbm);
         read[10] = 0xFF;
       }
       return BusStatus::kOk;
@@ -293,17 +308,19 @@ int32_t staged(uint8_t index, int16_t word) {
 constexpr uint8_t code(wire::CommandCode command) { return static_cast<uint8_t>(command); }
 constexpr uint8_t result(wire::CommandResult value) { return static_cast<uint8_t>(value); }
 
-// One command, and its answer: asked again with a new token while the node is busy.
+// One command, and its answer: asked again with a new token while the node is busy. No answer is no
+// result.
 wire::Acknowledgement ask(Team& team, Node& node, wire::CommandCode command, int32_t value) {
   static uint16_t token = 1000;
   wire::Acknowledgement answer = {};
   do {
     team.world.command(++token, code(command), value);
-    for (uint8_t tries = 0; tries < 20 && team.answer().token != token; ++tries) {
+    for (uint8_t tries = 0; tries < 40 && team.answer().token != token; ++tries) {
       team.run(node, 20);
     }
     answer = team.answer();
   } while (answer.token == token && answer.result == result(wire::CommandResult::kBusy));
+  if (answer.token != token) answer.result = 0xFF;
   return answer;
 }
 
@@ -370,16 +387,31 @@ TEST(motion_every_second_a_round_every_two_status_every_ten) {
   CHECK(team.sent(wire::MessageType::kRanges) >= 13);
   CHECK(team.sent(wire::MessageType::kRanges) <= 16);
   CHECK_EQUAL(4, team.sent(wire::MessageType::kStatus));  // the first one after half a second
+  CHECK_EQUAL(wire::MessageType::kMotion, team.world.frames[0].header.type);
+  CHECK_EQUAL(wire::MessageType::kStatus, team.world.frames[1].header.type);
   CHECK_EQUAL(0, team.sent(wire::MessageType::kSteps));
+  CHECK(team.world.pressures >= 200 && team.world.pressures <= 270);  // ten a second less looks
   CHECK_EQUAL(0, team.world.damaged);
   CHECK(team.world.marks > 1400);  // the tick is marked
 }
 
 TEST(a_round_holds_every_other_node_and_not_the_node_itself) {
   Team team;
-  team.run_ms(5000);
+  team.world.magnetometer_present = true;  // whose raw readings stand where ranges do
+  team.world.exchange_us = 20000;
+  team.run_ms(30000);
   wire::Ranges ranges;
-  CHECK(team.read(wire::MessageType::kRanges, &ranges));
+  for (uint16_t i = 0; i < team.world.count; ++i) {
+    const Sent& sent = team.world.frames[i];
+    if (sent.header.type != wire::MessageType::kRanges) continue;
+    CHECK(wire::decode(sent.body, sent.length, &ranges));
+    for (uint8_t k = 0; k < ranges.count; ++k) {
+      CHECK_EQUAL(1000u * ranges.entries[k].peer, ranges.entries[k].range_mm);
+    }
+  }
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(0, status.dropped_ranges);
   CHECK_EQUAL(5, ranges.count);
   const uint8_t peers[5] = {4, 5, 6, 1, 2};  // from this node on
   for (uint8_t i = 0; i < 5; ++i) {
@@ -483,7 +515,7 @@ TEST(a_node_retries_only_peers_it_ranged_recently_in_its_window) {
   for (uint8_t i = 0; i < 6; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
   relpos::RangingPlan plan = relpos::RangingPlan();
   plan.begin(0, 1);
-  uint16_t others = 0, in_a_row = 0, most_in_a_row = 0, most_later = 0;
+  uint16_t others = 0, in_a_row = 0, most_in_a_row = 0, most_later = 0, retried = 0;
   uint16_t busy_until_ms = 0;
   uint8_t previous = 0;
   for (uint16_t now_ms = 0; now_ms < 60000; ++now_ms) {
@@ -501,14 +533,40 @@ TEST(a_node_retries_only_peers_it_ranged_recently_in_its_window) {
     const bool gone = peer == 3 || (peer == 4 && now_ms >= 20000);  // 3 was never there
     if (peer == 3) CHECK_EQUAL(1, in_a_row);
     if (peer == 4 && in_a_row > most_in_a_row) most_in_a_row = in_a_row;
+    retried = static_cast<uint16_t>(retried + (peer == 4 && in_a_row > relpos::kRetries));
     if (peer == 4 && now_ms >= 37000 && in_a_row > most_later) most_later = in_a_row;
     others = static_cast<uint16_t>(others + (peer == 2 || peer > 4));
     plan.done(!gone);
     busy_until_ms = static_cast<uint16_t>(now_ms + 23);
   }
   CHECK_EQUAL(1 + relpos::kRetries, most_in_a_row);
+  CHECK(retried >= 4);         // in each round of the next 8 s
   CHECK_EQUAL(1, most_later);  // not ranged for 16 s
   CHECK(others >= 3 * 29);     // thirty rounds, the gone one takes nothing from the others
+}
+
+TEST(without_a_beacon_nobody_is_asked_twice_in_a_row_and_no_seed_makes_rounds_alike) {
+  for (const uint16_t seed : {0, 1234}) {
+    relpos::RangingPlan plan = relpos::RangingPlan();
+    plan.begin(0, seed);
+    uint16_t busy_until_ms = 0, first_ms = 0, begins = 0;
+    uint8_t previous = 0;
+    for (uint16_t now_ms = 0; now_ms < 20000; ++now_ms) {
+      if (now_ms < busy_until_ms) continue;
+      uint16_t wait_ms = 0;
+      const uint8_t peer = plan.next(now_ms, 1, 6, 2000, &wait_ms);
+      if (peer == 0) continue;
+      CHECK(peer != previous);
+      if (peer == 2) {
+        begins = static_cast<uint16_t>(begins + (now_ms % 2000 != first_ms));
+        first_ms = now_ms % 2000;
+      }
+      previous = peer;
+      plan.done(peer != 3 || now_ms < 3000);  // 3 was there
+      busy_until_ms = static_cast<uint16_t>(now_ms + 23);
+    }
+    CHECK(begins >= 8);
+  }
 }
 
 TEST(an_exchange_that_fails_after_the_next_beacon_costs_no_round) {
@@ -541,14 +599,15 @@ TEST(an_exchange_that_fails_after_the_next_beacon_costs_no_round) {
 }
 
 TEST(the_led_distinguishes_the_states) {
-  enum State { kWell, kNoBeacon, kSupplyLow, kSensorMissing };
+  enum State { kWell, kNoBeacon, kSupplyLow, kNoImu, kNoMagnetometer, kNoPozyx };
   // Flashes in 4.096 s, and the share of the time that it is lit, in per cent.
-  const uint8_t flashes[] = {4, 8, 4, 16}, lit[] = {6, 12, 75, 50};
-  for (uint8_t state = kWell; state <= kSensorMissing; ++state) {
+  const uint8_t flashes[] = {4, 8, 4, 16, 16, 16}, lit[] = {6, 12, 75, 50, 50, 50};
+  for (uint8_t state = kWell; state <= kNoPozyx; ++state) {
     Team team;
-    team.world.magnetometer_present = true;
-    team.world.inertial_present = state != kSensorMissing;
-    team.world.supply = state >= kSupplyLow ? 4499 : 4500;
+    team.world.magnetometer_present = state != kNoMagnetometer;
+    team.world.inertial_present = state != kNoImu;
+    team.world.tag_present = state != kNoPozyx;
+    team.world.supply = state >= kSupplyLow ? 4499 : state == kWell ? 4500 : 0;  // 0: not measured
     uint16_t before = 0;
     uint32_t lit_before_us = 0;
     for (uint8_t part = 0; part < 12; ++part) {
@@ -563,7 +622,7 @@ TEST(the_led_distinguishes_the_states) {
     CHECK(more >= -1 && more <= 1);
     // Without samples the loop sleeps for up to 100 ms.
     CHECK_NEAR(lit[state], (team.world.lit_us - lit_before_us) / 40960.0f,
-               state == kSensorMissing ? 15 : 3);
+               state == kNoImu ? 15 : 3);
   }
 }
 
@@ -637,6 +696,38 @@ TEST(a_node_that_is_not_in_the_beacon_ranges_by_itself) {
   CHECK_EQUAL(5, status.neighbours);
 }
 
+TEST(a_node_whose_number_is_beyond_the_team_ranges_all_of_it) {
+  Team team;
+  Node ninth(team.world);
+  ninth.begin(0, wire::ResetCause::kPowerOn, 9);
+  team.run(ninth, 24000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(6, status.neighbours);
+}
+
+TEST(a_beacon_within_a_window_begins_no_second_round) {
+  wire::Beacon beacon;
+  beacon.period_ms = 2000;
+  beacon.count = 4;
+  for (uint8_t i = 0; i < 4; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  relpos::RangingPlan plan = relpos::RangingPlan();
+  plan.begin(0, 1);
+  uint16_t exchanges = 0;
+  for (uint16_t now_ms = 0; now_ms < 20000; ++now_ms) {
+    if (now_ms % 1000 == 200) {
+      beacon.phase_ms = now_ms % 2000;
+      beacon.round = static_cast<uint8_t>(now_ms / 2000);
+      plan.beacon(now_ms, beacon, 1);
+    }
+    uint16_t wait_ms = 0;
+    if (now_ms % 25 != 0 || plan.next(now_ms, 1, 6, 2000, &wait_ms) == 0) continue;
+    plan.done(true);
+    exchanges = static_cast<uint16_t>(exchanges + (now_ms >= 2000));
+  }
+  CHECK_EQUAL(9 * 3, exchanges);
+}
+
 TEST(a_node_without_its_pozyx_reports_no_neighbours_and_no_old_team) {
   Team team;
   for (uint8_t second = 0; second < 12; ++second) {
@@ -678,10 +769,13 @@ TEST(a_replayed_beacon_moves_no_slot) {
   team.run_ms(100);
   team.world.host_counter -= 1;
   Slots::hear(team, 0, 9, 2);
+  team.world.host_counter -= 2;
+  Slots::hear(team, 0, 9, 2);
   team.run_ms(14000);
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
-  CHECK_EQUAL(1, status.refused_frames);
+  CHECK_EQUAL(2, status.refused_frames);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
 }
 
 // ---- height ----
@@ -725,7 +819,7 @@ TEST(a_climb_is_followed_within_a_second) {
 TEST(garbage_pressure_is_no_height_and_a_new_level_is_no_climb) {
   relpos::Barometer barometer = relpos::Barometer();
   for (uint8_t i = 0; i < 30; ++i) barometer.add(i % 3 == 0 ? 0 : 101325000);
-  for (uint32_t garbage : {0u, 4294967295u, 20000000u, 90000000u, 101325000u}) {
+  for (uint32_t garbage : {0u, 4294967295u, 20000000u, 90000000u, 110000000u, 101325000u}) {
     barometer.add(garbage);
     CHECK_NEAR(0.0f, barometer.height_m(), 0.01f);
   }
@@ -734,14 +828,18 @@ TEST(garbage_pressure_is_no_height_and_a_new_level_is_no_climb) {
 }
 
 TEST(a_pressure_sensor_with_invalid_readings_leaves_no_old_height) {
-  relpos::Barometer barometer = relpos::Barometer();
-  for (uint8_t i = 0; i < 20; ++i) barometer.add(101325000);
-  CHECK(barometer.ready());
-  for (uint8_t i = 0; i < 8; ++i) barometer.add(0);
-  CHECK(!barometer.ready());
-  for (uint8_t i = 0; i < 40; ++i) barometer.add(101325000 - 36000);
-  CHECK(barometer.ready());
-  CHECK_NEAR(3.0f, barometer.height_m(), 0.05f);
+  for (const uint32_t invalid : {0u, 130000000u}) {
+    relpos::Barometer barometer = relpos::Barometer();
+    for (uint8_t i = 0; i < 20; ++i) barometer.add(101325000);
+    CHECK(barometer.ready());
+    for (uint16_t i = 1; i < 300; ++i) {
+      barometer.add(invalid);
+      CHECK_EQUAL(i < 8, barometer.ready());
+    }
+    for (uint8_t i = 0; i < 40; ++i) barometer.add(101325000 - 36000);
+    CHECK(barometer.ready());
+    CHECK_NEAR(3.0f, barometer.height_m(), 0.05f);
+  }
 }
 
 TEST(a_height_beyond_the_message_is_not_reported) {
@@ -768,8 +866,15 @@ TEST(the_height_travels_with_the_motion_once_it_is_known) {
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK(motion.quality & static_cast<uint8_t>(wire::Quality::kHeightValid));
   CHECK_NEAR(300.0f, static_cast<float>(motion.height_cm), 3.0f);
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
+  team.run_ms(1500);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.health & static_cast<uint8_t>(wire::Health::kPressure));
   team.world.tag_present = false;
   team.run_ms(8000);
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(!(status.health & static_cast<uint8_t>(wire::Health::kPressure)));
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK(!(motion.quality & static_cast<uint8_t>(wire::Quality::kHeightValid)));
 }
@@ -802,6 +907,7 @@ TEST(the_schedule_does_not_feel_the_wrap_of_the_microseconds) {
     const Sent& b = late.world.frames[i];
     CHECK_EQUAL(a.header.type, b.header.type);
     CHECK_EQUAL(a.time_us, b.time_us - (0xFFFFFFFFu - 7000000u));
+    CHECK_BYTES(a.body, b.body, a.length);
   }
   wire::Motion motion;
   CHECK(late.read(wire::MessageType::kMotion, &motion));
@@ -858,6 +964,19 @@ TEST(motion_that_is_due_a_little_after_every_frame_leaves_room_for_ranges_and_st
   CHECK(team.sent(wire::MessageType::kStatus) >= 2);
 }
 
+TEST(a_weak_signal_is_told_with_its_range) {
+  for (const int8_t signal_dbm : {-96, -95}) {
+    Team team;
+    team.world.signal_dbm = signal_dbm;
+    team.run_ms(5000);
+    wire::Ranges ranges;
+    CHECK(team.read(wire::MessageType::kRanges, &ranges));
+    CHECK_EQUAL(signal_dbm, ranges.entries[0].rss_dbm);
+    CHECK_EQUAL(signal_dbm == -96 ? static_cast<uint8_t>(wire::RangeQuality::kWeakSignal) : 0,
+                ranges.entries[0].quality);
+  }
+}
+
 TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
   Team team;
   team.world.command(1, code(wire::CommandCode::kSetTeamSize), 20);
@@ -876,7 +995,13 @@ TEST(every_step_is_reported_at_its_own_time) {
   team.world.command(1, code(wire::CommandCode::kSetStepReports), 1);
   team.run_ms(5000);
   team.world.walking = true;
-  team.run_ms(12000);
+  team.run_ms(6000);
+  team.world.inertial_present = false;  // the dead reckoning starts anew: no step, no other time
+  team.run_ms(1500);
+  team.world.inertial_present = true;
+  team.run_ms(9300);
+  team.world.walking = false;  // the last one is a footfall that is known a second later
+  team.run_ms(4000);
   const float period_ms = 1000.0f * 2.0f * 3.14159f / 12.0f;  // of the world's walk
   float last_ms = 0.0f;
   uint16_t intervals = 0;
@@ -885,14 +1010,45 @@ TEST(every_step_is_reported_at_its_own_time) {
     wire::Steps steps;
     if (sent.header.type != wire::MessageType::kSteps) continue;
     CHECK(wire::decode(sent.body, sent.length, &steps));
+    CHECK(steps.count <= 3);  // told before there are more
     for (uint8_t k = 0; k < steps.count; ++k) {
       const float time_ms = static_cast<float>(steps.time_ms) - steps.entries[k].age_ms;
-      if (last_ms > 0.0f) CHECK_NEAR(period_ms, time_ms - last_ms, 45.0f);  // two ticks
+      CHECK(time_ms < 11500.0f || time_ms > 14000.0f);  // none between
+      const bool level = time_ms < 12000.0f || last_ms > 15000.0f;  // else that is still looked for
+      if (last_ms > 0.0f && level) CHECK_NEAR(period_ms, time_ms - last_ms, 45.0f);  // two ticks
       intervals += last_ms > 0.0f;
       last_ms = time_ms;
     }
   }
-  CHECK(intervals > 10);
+  CHECK(intervals > 20);
+  CHECK_NEAR(21800.0f + period_ms, last_ms, 100.0f);
+}
+
+TEST(a_step_is_told_within_four_seconds_however_few_there_are) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetStepReports, 1);
+  team.run_ms(5000);
+  team.world.walking = true;
+  team.run_ms(1000);
+  team.world.walking = false;
+  team.run_ms(4000);
+  wire::Steps steps;
+  CHECK(team.read(wire::MessageType::kSteps, &steps));
+  CHECK(steps.count < 3);
+}
+
+TEST(steps_are_reported_only_while_that_is_asked_for) {
+  Team team;
+  team.run_ms(5000);
+  team.world.walking = true;
+  team.run_ms(5000);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kSteps));
+  ask(team, team.node, wire::CommandCode::kSetStepReports, 1);
+  while (team.sent(wire::MessageType::kSteps) == 0) team.run_ms(100);
+  team.run_ms(700);  // another one waits to be told
+  ask(team, team.node, wire::CommandCode::kSetStepReports, 0);
+  team.run_ms(4000);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kSteps));
 }
 
 TEST(steps_that_are_dropped_are_not_counted_as_ranges) {
@@ -927,6 +1083,25 @@ TEST(the_status_has_what_the_uart_and_the_tag_complained_of) {
   CHECK_EQUAL(relpos::Pozyx::kTimedOut, status.ranging_error);
 }
 
+TEST(the_status_has_the_longest_tick_since_the_one_before) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 2000);
+  const auto worst_tick_us = [&](uint32_t bus_us) {
+    team.world.bus_us = bus_us;
+    team.run_ms(100);
+    team.world.bus_us = 100;
+    team.run_ms(2000);
+    wire::Status status = {};
+    team.read(wire::MessageType::kStatus, &status);
+    return status.worst_tick_us;
+  };
+  worst_tick_us(100);
+  const uint16_t slow_us = worst_tick_us(700);
+  CHECK(slow_us >= 700 && slow_us <= 2 * 700);  // the magnetometer is looked for now and then
+  CHECK(worst_tick_us(100) <= 2 * 100);
+  CHECK_EQUAL(65535, worst_tick_us(70000));
+}
+
 TEST(the_loop_never_waits_for_the_storage) {
   Team team;
   team.world.storage_us = 3400;
@@ -942,10 +1117,34 @@ TEST(the_loop_never_waits_for_the_storage) {
   CHECK_EQUAL(0, team.world.waited);
 }
 
+TEST(a_commit_in_the_moment_that_a_word_is_written_waits_for_nothing) {
+  Team team;
+  team.world.storage_us = 3400;
+  team.run_ms(2000);
+  for (uint8_t ms = 0; ms < 100; ++ms) {  // the word, then the mark of its command
+    team.run_ms(200);
+    team.world.waited = 0;
+    team.world.command(100 + ms, code(wire::CommandCode::kSetCalibration), staged(1, ms + 1));
+    for (uint16_t hundredth = 0; hundredth < 1200; ++hundredth) {
+      if (hundredth == 10 * ms) {
+        team.world.command(300 + ms, code(wire::CommandCode::kCommitCalibration), 1);
+      }
+      team.world.begin_poll();
+      team.node.poll(team.world.now);
+      team.world.now += 100;
+    }
+    CHECK_EQUAL(0, team.world.waited);
+  }
+}
+
 TEST(a_missing_imu_is_reported_and_stops_neither_ranges_nor_reports) {
   Team team;
   team.world.inertial_present = false;
-  team.run_ms(12000);
+  team.run_ms(1200);
+  wire::Status first;
+  CHECK(team.read(wire::MessageType::kStatus, &first));
+  CHECK(!(first.health & static_cast<uint8_t>(wire::Health::kImu)));
+  team.run_ms(10800);
   wire::Motion motion;
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStarting), motion.state);
@@ -964,16 +1163,115 @@ TEST(a_missing_tag_stops_only_the_ranges) {
   CHECK(team.sent(wire::MessageType::kMotion) >= 10);
 }
 
-TEST(a_node_whose_imu_falls_silent_is_starting_again) {
+TEST(a_node_whose_imu_falls_silent_is_starting_again_and_has_no_compass_either) {
   Team team;
+  team.world.magnetometer_present = true;
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
   team.run_ms(20000);
+  const uint8_t sensors = static_cast<uint8_t>(wire::Health::kImu) |
+                          static_cast<uint8_t>(wire::Health::kMagnetometer);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(sensors, status.health & sensors);
   wire::Motion motion;
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStanding), motion.state);
+  CHECK(motion.quality & static_cast<uint8_t>(wire::Quality::kMagnetometerValid));
   team.world.inertial_present = false;
   team.run_ms(3000);
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStarting), motion.state);
+  CHECK(!(motion.quality & static_cast<uint8_t>(wire::Quality::kMagnetometerValid)));
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(0, status.health & sensors);
+}
+
+TEST(a_short_gap_of_samples_is_counted_and_one_of_over_a_fifth_of_a_second_starts_anew) {
+  for (const uint16_t gap_ms : {90, 250}) {
+    Team team;
+    ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
+    ask(team, team.node, wire::CommandCode::kSetReportPeriodMs, 100);
+    team.run_ms(12000);
+    wire::Status before, status;
+    CHECK(team.read(wire::MessageType::kStatus, &before));
+    const uint32_t since_ms = team.world.now / 1000;
+    team.world.samples = false;
+    team.run_ms(gap_ms);
+    wire::Motion motion;
+    CHECK(team.read(wire::MessageType::kMotion, &motion));
+    CHECK(motion.time_ms <= since_ms);  // the motion ends with the last sample
+    team.world.samples = true;
+    team.run_ms(2000);
+    CHECK(team.read(wire::MessageType::kStatus, &status));
+    // After 0.12 s the sensor is set up anew, which takes longer than the gap.
+    const float missed = static_cast<float>(status.missed_ticks - before.missed_ticks);
+    CHECK_NEAR(gap_ms / 20.0f, missed, gap_ms > 120 ? 7.0f : 1.1f);
+    uint8_t quality = 0;
+    for (uint16_t i = static_cast<uint16_t>(team.world.count - 25); i < team.world.count; ++i) {
+      const Sent& sent = team.world.frames[i];
+      if (sent.header.type != wire::MessageType::kMotion) continue;
+      CHECK(wire::decode(sent.body, sent.length, &motion));
+      quality |= motion.quality;
+    }
+    CHECK(quality & static_cast<uint8_t>(wire::Quality::kImuGap));
+    CHECK_EQUAL(gap_ms > 200, (quality & static_cast<uint8_t>(wire::Quality::kFilterReset)) != 0);
+  }
+}
+
+TEST(quality_tells_of_saturation_a_strange_field_and_an_axis_that_is_not_known) {
+  const uint8_t saturated = static_cast<uint8_t>(wire::Quality::kSaturated);
+  const uint8_t valid = static_cast<uint8_t>(wire::Quality::kMagnetometerValid);
+  const uint8_t disturbed = static_cast<uint8_t>(wire::Quality::kMagnetometerDisturbed);
+  for (const bool spins : {false, true}) {
+    Team team;
+    team.world.magnetometer_present = true;
+    team.run_ms(3000);
+    wire::Motion motion;
+    CHECK(team.read(wire::MessageType::kMotion, &motion));
+    CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStarting), motion.state);
+    team.run_ms(9000);
+    CHECK(team.read(wire::MessageType::kMotion, &motion));
+    CHECK_EQUAL(valid | static_cast<uint8_t>(wire::Quality::kForwardAxisUnknown),
+                motion.quality & ~static_cast<uint8_t>(wire::Quality::kHeightValid));
+    (spins ? team.world.rate : team.world.force) = 32767;
+    team.world.field = 255;  // 76 uT
+    team.run_ms(1500);
+    CHECK(team.read(wire::MessageType::kMotion, &motion));
+    CHECK_EQUAL(saturated | disturbed, motion.quality & (saturated | disturbed | valid));
+    team.world.field = 100;
+    team.world.field_fails = true;  // a heading of two seconds ago is none
+    team.run_ms(3000);
+    CHECK(team.read(wire::MessageType::kMotion, &motion));
+    CHECK_EQUAL(0, motion.quality & valid);
+  }
+}
+
+TEST(a_calibrated_sensor_has_lower_limits_and_a_surer_gyroscope) {
+  wire::Motion of[2] = {}, walked = {};
+  for (uint8_t calibrated = 0; calibrated < 2; ++calibrated) {
+    for (const bool spins : {false, true}) {
+      Team team;
+      Words words = {};
+      words.word[wire::kGyroBiasSigma] = 29;  // 0.1 deg/s; else 1
+      if (calibrated) {
+        stage(team, team.node, words);
+        ask(team, team.node, wire::CommandCode::kCommitCalibration, words.crc());
+        team.run_ms(200);
+      }
+      Node again(team.world);
+      team.world.count = 0;
+      again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+      team.world.walking = true;
+      team.run(again, 8000);
+      if (!spins) CHECK(team.read(wire::MessageType::kMotion, calibrated ? &of[1] : &of[0]));
+      team.world.walking = false;
+      (spins ? team.world.rate : team.world.force) = 31500;
+      team.run(again, 1500);
+      CHECK(team.read(wire::MessageType::kMotion, &walked));
+      CHECK_EQUAL(calibrated, (walked.quality & static_cast<uint8_t>(wire::Quality::kSaturated)) != 0);
+    }
+  }
+  CHECK(of[1].variance_heading_100urad2 * 20.0f < of[0].variance_heading_100urad2);
 }
 
 TEST(an_imu_that_was_away_gives_a_gap_a_reset_and_a_larger_variance) {
@@ -1066,18 +1364,87 @@ TEST(a_late_repetition_does_not_undo_a_newer_command) {
   CHECK_EQUAL(950, team.answer().value);
 }
 
+TEST(a_token_that_is_used_anew_for_another_command_is_another_one) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetTeamSize), 9);
+  team.run_ms(300);
+  team.world.command(7, code(wire::CommandCode::kSetLegLengthMm), 900);
+  team.run_ms(300);
+  CHECK_EQUAL(code(wire::CommandCode::kSetLegLengthMm), team.answer().command);
+  CHECK_EQUAL(900, ask(team, team.node, wire::CommandCode::kSetLegLengthMm, 0).value);
+}
+
+TEST(a_fifth_command_while_four_answers_wait_is_not_done_and_counted) {
+  Team team;
+  team.run_ms(2000);
+  team.world.line_bytes = 0;
+  for (uint8_t i = 0; i < 5; ++i) {
+    team.world.command(20 + i, code(wire::CommandCode::kSetTeamSize), 10 + i);
+  }
+  team.run_ms(1000);
+  team.world.line_bytes = 255;
+  team.run_ms(12000);
+  CHECK_EQUAL(4, team.sent(wire::MessageType::kAcknowledgement));
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(1, status.bad_frames);
+  CHECK_EQUAL(13, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
+}
+
+TEST(a_setting_that_is_as_it_was_wears_no_storage_and_a_gain_has_one_more_version_each_time) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetLegLengthMm, 900);
+  ask(team, team.node, wire::CommandCode::kSetStepGainPermille, 2000);
+  const auto versions = [&] {
+    team.run_ms(1500);
+    wire::Motion motion = {};
+    team.read(wire::MessageType::kMotion, &motion);
+    return motion.gain_version;
+  };
+  CHECK_EQUAL(2, versions());
+  memset(team.world.writes, 0, sizeof team.world.writes);
+  ask(team, team.node, wire::CommandCode::kSetStepGainPermille, 2000);
+  CHECK_EQUAL(2, versions());
+  const uint16_t settings = relpos::kStoredRecords + relpos::stored_bytes(sizeof(relpos::Marks));
+  for (uint16_t at = settings; at < relpos::kStorageBytes; ++at) CHECK_EQUAL(0, team.world.writes[at]);
+}
+
+TEST(gain_and_leg_are_in_force_at_once_and_a_gain_is_surer_than_that_of_everybody) {
+  wire::Motion of[3] = {};
+  for (uint8_t set = 0; set < 3; ++set) {
+    Team team;
+    if (set == 1) ask(team, team.node, wire::CommandCode::kSetStepGainPermille, 1070);
+    if (set == 2) ask(team, team.node, wire::CommandCode::kSetLegLengthMm, 465);
+    team.run_ms(5000);
+    team.world.walking = true;
+    team.run_ms(20000);
+    CHECK(team.read(wire::MessageType::kMotion, &of[set]));
+  }
+  CHECK(of[0].path_mm > 1000);
+  CHECK_NEAR(0.5f, static_cast<float>(of[1].path_mm) / of[0].path_mm, 0.05f);
+  CHECK_NEAR(0.63f, static_cast<float>(of[2].path_mm) / of[0].path_mm, 0.05f);  // 1/2 to the 2/3
+  const float relative[2] = {static_cast<float>(of[0].scale_error_mm) / of[0].path_mm,
+                             static_cast<float>(of[1].scale_error_mm) / of[1].path_mm};
+  CHECK_NEAR(0.06f, relative[0], 0.005f);
+  CHECK_NEAR(0.05f, relative[1], 0.005f);
+}
+
 TEST(a_command_for_another_node_or_a_damaged_one_does_nothing) {
   Team team;
   team.world.command(7, code(wire::CommandCode::kSetLed), 1, kId + 1);
   team.run_ms(300);
   const uint8_t garbage[12] = {0x81, 0, 0, 0x28, 0, 0xB5, 1, 16, 3, 0, 0, 0};
   team.world.give(garbage, sizeof garbage);
+  const uint8_t short_command[2] = {7, 0};  // sealed well
+  team.world.down(wire::MessageType::kCommand, short_command, 2, kId, ++team.world.host_counter);
+  const uint8_t module_restarted[2] = {0x8A, 0};
+  team.world.give(module_restarted, sizeof module_restarted);
   team.run_ms(300);
   CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
   team.run_ms(12000);
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
-  CHECK_EQUAL(1, status.bad_frames);
+  CHECK_EQUAL(3, status.bad_frames);
 }
 
 TEST(an_unknown_command_is_answered_as_unknown) {
@@ -1101,6 +1468,7 @@ TEST(a_transaction_for_the_host_answers_what_was_read_and_how_long_it_took) {
   // The last two of a range's eleven bytes: -80 dBm.
   const int32_t row = static_cast<int32_t>(0xB302C74B);
   answer = ask(team, team.node, wire::CommandCode::kAccessBus, row);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), answer.result);
   CHECK_EQUAL(0xFFB0, answer.value & 0xFFFF);
   answer = ask(team, team.node, wire::CommandCode::kAccessBus, 0x11007569);
   CHECK_EQUAL(result(wire::CommandResult::kNoAnswer), answer.result);
@@ -1108,6 +1476,7 @@ TEST(a_transaction_for_the_host_answers_what_was_read_and_how_long_it_took) {
   const int32_t most = static_cast<int32_t>(0xFFFFFF68);
   answer = ask(team, team.node, wire::CommandCode::kAccessBus, most);
   CHECK_EQUAL(result(wire::CommandResult::kDone), answer.result);
+  CHECK_EQUAL(3, team.world.written);
 }
 
 TEST(settings_survive_a_restart_and_a_torn_copy) {
@@ -1123,6 +1492,17 @@ TEST(settings_survive_a_restart_and_a_torn_copy) {
   CHECK_EQUAL(3, ranges.count);
 }
 
+TEST(a_stored_number_that_nobody_may_have_or_that_is_damaged_makes_node_1) {
+  for (const uint8_t stored : {0, 7, 8, 255}) {
+    Team team;
+    team.world.eeprom[relpos::kStoredNodeId] = stored;
+    team.world.eeprom[relpos::kStoredNodeIdComplement] = stored == 8 ? 0xF6 : stored ^ 0xFF;
+    Node again(team.world);
+    again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+    CHECK_EQUAL(stored == 7 ? 7 : 1, again.id());
+  }
+}
+
 TEST(every_start_counts) {
   Team team;
   CHECK_EQUAL(0, team.world.eeprom[relpos::kStoredBootCount]);
@@ -1135,19 +1515,46 @@ TEST(every_start_counts) {
 
 TEST(a_reboot_is_acknowledged_first_and_not_repeated_by_the_same_command) {
   Team team;
+  Node node(team.world);  // the second start: the complement of 0 is what an erased byte is
+  node.begin(0, wire::ResetCause::kPowerOn, 0);
   team.world.command(7, code(wire::CommandCode::kReboot), 0);
-  team.run_ms(1000);
+  team.run(node, 1000);
   CHECK_EQUAL(1, team.world.restarts);
   CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
   Node again(team.world);
   again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  ask(team, again, wire::CommandCode::kPing, 0);  // another one comes first
   team.world.command(7, code(wire::CommandCode::kReboot), 0);  // the answer had been lost
   team.run(again, 3000);
   CHECK_EQUAL(1, team.world.restarts);
-  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  CHECK_EQUAL(3, team.sent(wire::MessageType::kAcknowledgement));
+  CHECK_EQUAL(7, team.answer().token);
+  CHECK_EQUAL(code(wire::CommandCode::kReboot), team.answer().command);
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
   CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kCommand), status.reset_cause);
+}
+
+TEST(no_other_command_is_taken_while_a_restart_is_written_down) {
+  for (const uint8_t before : {0, 3}) {  // commands, so that the reboot is the first or the last kept
+    Team team;
+    team.world.storage_us = 3400;
+    team.run_ms(500);
+    for (uint8_t i = 0; i < before; ++i) ask(team, team.node, wire::CommandCode::kPing, 0);
+    team.world.command(7, code(wire::CommandCode::kReboot), 0);
+    while (team.world.eeprom[relpos::kStoredReboot] != 7) team.run_ms(1);
+    team.world.command(8, code(wire::CommandCode::kSetTeamSize), 9);
+    team.run_ms(1000);
+    CHECK_EQUAL(1, team.world.restarts);
+    Node again(team.world);
+    again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+    team.run(again, 1000);
+    team.world.command(7, code(wire::CommandCode::kReboot), 0);
+    team.run(again, 1000);
+    CHECK_EQUAL(1, team.world.restarts);
+    CHECK_EQUAL(7, team.answer().token);
+    CHECK_EQUAL(6, ask(team, again, wire::CommandCode::kSetTeamSize, 0).value);
+  }
 }
 
 TEST(a_reboot_is_known_where_the_boot_loader_hides_the_cause) {
@@ -1254,6 +1661,19 @@ TEST(whole_turns_count_and_a_reset_of_the_filter_sets_nothing_back) {
   wire::Motion motion;
   totals.fill(now, &motion);
   CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
+  relpos::MotionTotals right = relpos::MotionTotals();
+  for (int16_t degree = 0; degree >= -200; degree -= 10) {
+    now.heading_rad = static_cast<float>(degree < -180 ? degree + 360 : degree) * 0.01745329f;
+    right.track(now);
+  }
+  right.fill(now, &motion);
+  CHECK_NEAR(-34907.0f, static_cast<float>(motion.heading_100urad), 2.0f);
+  right.rebase(now, 600.0f);
+  right.fill(relpos::Displacement(), &motion);  // charged like a minute
+  CHECK_NEAR(3.721e9f, static_cast<float>(motion.variance_along_mm2), 1e3f);
+  CHECK_NEAR(3.721e9f, static_cast<float>(motion.variance_across_mm2), 1e3f);
+  CHECK_NEAR(3.2898681e8f, static_cast<float>(motion.variance_heading_100urad2), 1e3f);  // any
+  now.heading_rad = 1.5707963f;
   totals.rebase(now, 0.5f);
   relpos::Displacement anew = relpos::Displacement();
   anew.x_m = 2.0f;  // ahead, which is now the old frame's left
@@ -1265,6 +1685,8 @@ TEST(whole_turns_count_and_a_reset_of_the_filter_sets_nothing_back) {
   CHECK_EQUAL(4, motion.steps);  // wrapped
   CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
   CHECK_NEAR(2250000.0f, static_cast<float>(motion.variance_along_mm2), 1.0f);
+  CHECK_NEAR(2250000.0f, static_cast<float>(motion.variance_across_mm2), 1.0f);
+  CHECK_NEAR(6250000.0f, static_cast<float>(motion.variance_heading_100urad2), 1.0f);
 }
 
 TEST(no_calibration_changes_nothing) {
@@ -1360,17 +1782,21 @@ TEST(a_node_that_reports_raw_samples_does_not_range_and_then_ranges_again) {
 }
 
 TEST(ranges_that_wait_when_ranging_ends_are_sent_or_counted) {
-  for (const bool raw : {false, true}) {
+  enum End { kOff, kRaw, kNoTag, kNoLine };
+  for (uint8_t end = kOff; end <= kNoLine; ++end) {
     for (uint16_t moment_ms = 0; moment_ms < 2000; moment_ms += 100) {
       Team team;
       team.world.exchange_us = 20000;
       team.run_ms(4000u + moment_ms);
-      if (raw) {
+      if (end == kRaw) {
         team.world.command(9, code(wire::CommandCode::kSetRawReports), 5);
         team.run_ms(3000);
       }
-      team.world.command(10, code(wire::CommandCode::kSetRangingPeriodMs), 0);
-      team.run_ms(1500);
+      if (end == kNoTag) team.world.tag_present = false;
+      if (end == kNoLine) team.world.line_bytes = 0;
+      if (end != kNoTag) team.world.command(10, code(wire::CommandCode::kSetRangingPeriodMs), 0);
+      team.run_ms(end == kNoLine ? 70000 : 1500);  // ages have 16 bits of milliseconds
+      team.world.line_bytes = 255;
       team.world.command(11, code(wire::CommandCode::kSetStatusPeriodMs), 1000);
       team.run_ms(2500);
       uint16_t sent = 0;
@@ -1380,6 +1806,9 @@ TEST(ranges_that_wait_when_ranging_ends_are_sent_or_counted) {
         if (frame.header.type != wire::MessageType::kRanges) continue;
         CHECK(wire::decode(frame.body, frame.length, &ranges));
         sent = static_cast<uint16_t>(sent + ranges.count);
+        for (uint8_t k = 0; k < ranges.count && end == kNoLine; ++k) {
+          CHECK(ranges.time_ms - ranges.entries[k].age_ms <= 4200u + moment_ms);
+        }
       }
       wire::Status status;
       CHECK(team.read(wire::MessageType::kStatus, &status));
@@ -1479,6 +1908,18 @@ TEST(a_replayed_forged_or_foreign_frame_touches_nothing) {
   CHECK(team.read(wire::MessageType::kStatus, &status));
   CHECK_EQUAL(2, status.refused_frames);
   CHECK_EQUAL(0, status.bad_frames);
+}
+
+TEST(a_frame_of_a_node_s_own_sent_back_to_it_makes_no_command_old) {
+  Team team;
+  const wire::Acknowledgement own = {7, 0, 0, 0};
+  uint8_t body[wire::kFrameBytes];
+  const uint8_t length = wire::encode(own, body);
+  ask(team, team.node, wire::CommandCode::kPing, 0);
+  const uint32_t next = team.world.host_counter + 1;
+  team.world.down(wire::MessageType::kAcknowledgement, body, length, kId, next + 5);
+  team.run_ms(300);
+  CHECK_EQUAL(9, ask(team, team.node, wire::CommandCode::kSetTeamSize, 9).value);
 }
 
 TEST(a_counter_that_does_not_follow_is_refused_with_the_newest_and_the_next_one_is_obeyed) {
@@ -1616,6 +2057,45 @@ TEST(counters_go_on_in_the_next_block_and_wear_the_storage_little) {
   for (uint16_t count : team.world.writes) CHECK(count <= newest / 1024 + 1);
 }
 
+TEST(a_counter_is_stored_before_it_is_used) {
+  Team team;
+  team.world.storage_us = 3400;
+  ask(team, team.node, wire::CommandCode::kSetReportPeriodMs, 100);
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
+  ask(team, team.node, wire::CommandCode::kSetRangingPeriodMs, 200);  // some frames at once
+  for (uint16_t i = 0; i < 10000; ++i) {
+    team.run_ms(20);
+    if (team.world.count == 0) continue;
+    const uint32_t used = team.world.frames[team.world.count - 1].header.counter;
+    if (team.world.count > kMostFrames / 2) team.world.count = 0;
+    relpos::Persistent stored;
+    relpos::Storage().load(team.world, &stored);
+    CHECK(used < stored.marks_.counter_end);
+  }
+}
+
+// The second command changes the record while the first one's is being written.
+TEST(a_power_cut_while_a_record_changes_that_is_being_written_leaves_a_good_copy) {
+  for (uint32_t apart_ms = 1; apart_ms < 80; apart_ms += 6) {
+    for (uint32_t cut = 1; cut < 50; cut += 2) {
+      Team team;
+      team.run_ms(300);
+      ask(team, team.node, wire::CommandCode::kPing, 0);
+      const uint32_t obeyed = team.world.host_counter;
+      team.world.storage_us = 3400;
+      team.world.writes_left = cut;
+      team.world.command(7, code(wire::CommandCode::kPing), 0);
+      team.run_ms(apart_ms);
+      team.world.command(8, code(wire::CommandCode::kPing), 0);
+      for (uint8_t ms = 0; ms < 250 && team.world.writes_left > 0; ++ms) team.run_ms(1);
+      team.world.writes_left = 0xFFFFFFFF;
+      relpos::Persistent stored;
+      relpos::Storage().load(team.world, &stored);
+      CHECK(stored.marks_.command >= obeyed && stored.marks_.command <= obeyed + 2);
+    }
+  }
+}
+
 // The body of a frame that gives a node these keys; masking and unmasking are the same.
 void fill_new_keys(const uint8_t* old_key, uint32_t counter, const uint8_t* key,
                    const uint8_t* beacon_key, uint8_t* body) {
@@ -1682,11 +2162,13 @@ TEST(a_first_key_comes_by_cable_and_the_next_ones_by_radio_too) {
   team.run_ms(1500);  // without a transmit status the answer was the last frame for a while
   CHECK_EQUAL(result(wire::CommandResult::kDone),
               (team.world.host_counter = 9000, ask(team, team.node, wire::CommandCode::kPing, 0).result));
-  keys.give(team, 9100);
-  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
-  keys.own[5] ^= 1;
-  keys.give(team, 9200, false);
-  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  for (const bool by_cable : {true, false}) {
+    team.world.count = 0;
+    keys.own[5] ^= 1;
+    keys.give(team, by_cable ? 9100 : 9200, by_cable);
+    CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));  // under the new keys
+    CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  }
 }
 
 TEST(after_keys_a_b_and_a_again_no_old_command_is_obeyed) {

@@ -30,6 +30,7 @@ struct Chip : FakeBoard {
   uint32_t pressure_mpa = 101325000;
   uint8_t foreign = 0;         // at so many looks left another's exchange ends, answered by this chip
 
+  uint16_t fails_at = 0;       // this transaction is not acknowledged
   uint16_t transactions = 0;
   uint16_t exchanges = 0;
   uint16_t asked_peer = 0;     // by DO_RANGING
@@ -42,7 +43,7 @@ struct Chip : FakeBoard {
                          const uint8_t* second, uint8_t second_count, uint8_t* read,
                          uint8_t read_count) override {
     ++transactions;
-    if (!present || address != 0x4B) return BusStatus::kAddressNack;
+    if (!present || address != 0x4B || transactions == fails_at) return BusStatus::kAddressNack;
     if (first_count == 1 && second_count == 0 && read_count == 1) {
       if (first[0] == 0x00) return give(read, identity);
       if (first[0] == 0x04) return give(read, code);
@@ -181,6 +182,9 @@ TEST(an_absent_chip_is_looked_for_until_it_comes) {
   CHECK(!bench.pozyx.running());
   CHECK_EQUAL(5, bench.chip.transactions);  // 0.25 s, then once a second
   CHECK_EQUAL(5, bench.chip.bus_errors());
+  uint32_t wait_us = 0;
+  bench.pozyx.step(bench.chip, bench.now_us - 2000, &wait_us, &bench.result);  // too early
+  CHECK_EQUAL(5, bench.chip.transactions);
   bench.chip.present = true;
   bench.run(2000000);
   CHECK(bench.pozyx.ready());
@@ -346,6 +350,11 @@ TEST(between_exchanges_the_pressure_is_read_and_the_identity_watched) {
   }
   CHECK_EQUAL(14, pressures);
   CHECK(bench.pozyx.ready());
+  for (uint8_t i = 0; i < 8; ++i) {  // one look at the identity that fails is no restart
+    if (i == 7) bench.chip.fails_at = static_cast<uint16_t>(bench.chip.transactions + 1);
+    CHECK_EQUAL(i < 7, bench.pozyx.look(bench.chip, &pressure_mpa));
+  }
+  CHECK(bench.pozyx.ready());
   bench.chip.network_id = 0x6000;  // it has restarted
   for (uint8_t i = 0; i < 8 && bench.pozyx.ready(); ++i) bench.pozyx.look(bench.chip, &pressure_mpa);
   CHECK(!bench.pozyx.running());
@@ -423,6 +432,13 @@ TEST(a_chip_clock_that_wraps_goes_on) {
   CHECK(bench.exchange(3) && bench.result.success);
 }
 
+TEST(a_first_distance_is_taken_whatever_the_chip_s_clock_shows) {
+  Bench bench;
+  bench.set_up();
+  bench.chip.time_ms = 0x90000000;  // after 28 days
+  CHECK(bench.exchange(3) && bench.result.success);
+}
+
 TEST(a_chip_that_stays_silent_is_set_up_anew) {
   Bench bench;
   bench.set_up();
@@ -458,6 +474,43 @@ TEST(a_chip_that_drops_off_the_bus_is_set_up_anew_and_counted) {
   CHECK(bench.result.success);
 }
 
+TEST(a_transaction_that_fails_elsewhere_than_in_a_poll_ends_the_exchange) {
+  const uint8_t which[] = {1, 2, 3, 7};  // before, clear, call; behind three polls, fetch
+  for (const uint8_t failing : which) {
+    Bench bench;
+    bench.set_up();
+    bench.chip.fails_at = static_cast<uint16_t>(bench.chip.transactions + failing);
+    CHECK(bench.exchange(4));
+    CHECK(!bench.result.success);
+    CHECK_EQUAL(Pozyx::kBusFailed, bench.result.error);
+    CHECK_EQUAL(bench.chip.fails_at, bench.chip.transactions);
+  }
+}
+
+TEST(failures_count_in_a_row_alone) {
+  enum End { kDistance, kError, kSetUp };
+  for (uint8_t end = kDistance; end <= kSetUp; ++end) {
+    Bench bench;
+    bench.set_up();
+    for (uint8_t round = 0; round < 2; ++round) {
+      bench.chip.silent = true;
+      for (uint8_t i = 0; i < (end == kSetUp && round == 0 ? 5 : 4); ++i) CHECK(bench.exchange(3));
+      CHECK_EQUAL(end != kSetUp || round != 0, bench.pozyx.ready());
+      bench.chip.silent = false;
+      if (end == kSetUp) {
+        bench.run(1000000);
+        continue;
+      }
+      bench.chip.code = end == kError ? 0x12 : 0;
+      bench.chip.time_ms += 100;
+      CHECK(bench.exchange(3));
+      CHECK_EQUAL(end == kDistance, bench.result.success);
+      bench.chip.code = 0;
+    }
+    CHECK(bench.pozyx.ready());
+  }
+}
+
 TEST(one_failed_poll_loses_no_distance) {
   Bench bench;
   bench.set_up();
@@ -467,6 +520,7 @@ TEST(one_failed_poll_loses_no_distance) {
     bench.chip.present = i < 3;
     bench.pozyx.step(bench.chip, bench.now_us, &wait_us, &bench.result);
   }
+  CHECK_EQUAL(5000, wait_us);  // a stuck bus costs six milliseconds each time
   bench.chip.present = true;
   CHECK(bench.run(1000000));
   CHECK(bench.result.success);

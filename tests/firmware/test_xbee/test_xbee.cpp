@@ -199,6 +199,9 @@ TEST(only_a_frame_that_is_reported_as_delivered_is_delivered) {
   CHECK(bench.xbee.undelivered());
   CHECK_EQUAL(0, bench.receive(kStatusNoAck, sizeof kStatusNoAck));
   CHECK(bench.xbee.undelivered());
+  const uint8_t another_s[] = {0x7e, 0x00, 0x03, 0x89, 0x02, 0x00, 0x74};
+  CHECK_EQUAL(0, bench.receive(another_s, sizeof another_s));
+  CHECK(bench.xbee.undelivered());
   CHECK_EQUAL(0, bench.receive(kStatusGood, sizeof kStatusGood));
   CHECK(!bench.xbee.undelivered());
   CHECK_EQUAL(0, bench.xbee.bad_frames());
@@ -268,7 +271,11 @@ TEST(lengths_that_cannot_be_are_refused) {
   CHECK_EQUAL(3, bench.xbee.bad_frames());
   CHECK_EQUAL(0, bench.receive(short_status, sizeof short_status));
   CHECK_EQUAL(4, bench.xbee.bad_frames());
+  const uint8_t type_alone[] = {0x7e, 0x00, 0x01, 0x81, 0x7d, 0x5e};  // its checksum is 0x7e
+  CHECK_EQUAL(0, bench.receive(type_alone, sizeof type_alone));
+  CHECK_EQUAL(5, bench.xbee.bad_frames());
   CHECK_EQUAL(1, bench.receive(kReceive16, sizeof kReceive16));
+  CHECK_EQUAL(5, bench.xbee.bad_frames());
 }
 
 TEST(the_longest_payload_fits_and_one_byte_more_is_refused) {
