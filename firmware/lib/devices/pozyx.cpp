@@ -93,34 +93,23 @@ bool Pozyx::look(Board& board, uint32_t* pressure_mpa) {
   const bool identity = (++looks_ & 7) == 0;
   uint8_t answer[4];
   const bool answered = transact(board, identity ? State::kWatch : State::kIdle, answer);
-  if (!answered) count_failure();
+  if (!answered) ++failures_;
   if (failures_ >= kMostFailures || (answered && identity && little_endian(answer) != network_id_)) {
     begin(network_id_);
-    return false;
   }
   *pressure_mpa = little_endian_long(answer);
   return answered && !identity;
 }
 
-void Pozyx::count_failure() {
-  if (failures_ < kMostFailures) ++failures_;
-}
-
 // Ends the exchange; after too many failures the chip has lost its settings or the bus.
-Pozyx::Event Pozyx::done(uint8_t error, uint32_t* wait_us, Result* result) {
+Pozyx::Event Pozyx::done(uint8_t error, Result* result) {
   result->peer = static_cast<uint8_t>(peer_);
   result->success = error == 0;
   result->error = error;
-  if (error != 0) {
-    result->range_mm = 0;
-    result->rss_dbm = 0;
-  }
   if (failures_ >= kMostFailures) {
     begin(network_id_);
-    *wait_us = 0;
   } else {
     state_ = State::kIdle;
-    *wait_us = kIdleUs;
   }
   return Event::kDone;
 }
@@ -158,10 +147,10 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
   }
 
   if (!answered) {
-    count_failure();
+    ++failures_;
     // While the exchange runs one may be lost.
     if (state_ != State::kPoll || failures_ >= kMostFailures) {
-      return done(kBusFailed, wait_us, result);
+      return done(kBusFailed, result);
     }
   }
   switch (state_) {
@@ -198,8 +187,8 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       if (reached(now_us, due_us_)) {
         // Neither a result nor an error: setting the chip up anew may help. (Not by the mask, which
         // concerns the interrupt's pin: without it the flags show as well.)
-        count_failure();
-        return done(kTimedOut, wait_us, result);
+        ++failures_;
+        return done(kTimedOut, result);
       }
       *wait_us = answered ? kPollUs : kFailedPollUs;
       return Event::kNothing;
@@ -207,7 +196,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
     case State::kError:
       failures_ = 0;
       // An error flag with code 0 is still no distance.
-      return done(answer[0] != 0 ? answer[0] : static_cast<uint8_t>(kRefused), wait_us, result);
+      return done(answer[0] != 0 ? answer[0] : static_cast<uint8_t>(kRefused), result);
 
     default:
       break;
@@ -223,12 +212,12 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
     return Event::kNothing;
   }
   const uint32_t range_mm = little_endian_long(answer + 5);
-  if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, wait_us, result);
+  if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, result);
   last_ms_ = time_ms;
   const int16_t rss_dbm = static_cast<int16_t>(little_endian(answer + 9));
   result->range_mm = range_mm;
   result->rss_dbm = static_cast<int8_t>(rss_dbm < -128 ? -128 : rss_dbm > 127 ? 127 : rss_dbm);
-  return done(0, wait_us, result);
+  return done(0, result);
 }
 
 }  // namespace relpos

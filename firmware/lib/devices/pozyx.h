@@ -25,8 +25,8 @@ class Pozyx {
   struct Result {
     uint8_t peer;
     bool success;
-    uint32_t range_mm;  // 0 without success
-    int8_t rss_dbm;     // clamped; 0 without success
+    uint32_t range_mm;  // only with success, as the next
+    int8_t rss_dbm;     // clamped
     uint8_t error;      // the chip's code or Error; 0 with success
   };
 
@@ -66,8 +66,7 @@ class Pozyx {
 
   bool transact(Board& board, State state, uint8_t* answer);  // that of the state; false: the bus failed
   void advance() { state_ = static_cast<State>(static_cast<uint8_t>(state_) + 1); }
-  Event done(uint8_t error, uint32_t* wait_us, Result* result);
-  void count_failure();
+  Event done(uint8_t error, Result* result);
 
   uint32_t due_us_;
   uint32_t before_ms_;  // the chip's time of the peer's row before the exchange; 0: none

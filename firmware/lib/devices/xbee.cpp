@@ -42,7 +42,6 @@ bool Xbee::send(uint16_t destination, const uint8_t* data, uint8_t length) {
   destination_ = destination;
   position_ = 0;
   sent_sum_ = 0;
-  sent_escape_ = false;
   // 0 would ask for no status.
   if (++frame_id_ == 0) frame_id_ = 1;
   sending_ = true;
@@ -106,7 +105,6 @@ RELPOS_SHARED bool Xbee::take(uint8_t byte) {
     took_escape_ = false;
     return false;
   }
-  if (part_ == Part::kNone) return false;
   if (byte == kEscape) {
     took_escape_ = true;
     return false;
@@ -145,11 +143,10 @@ RELPOS_SHARED bool Xbee::take(uint8_t byte) {
 RELPOS_SHARED void Xbee::take_data(uint8_t byte) {
   if (index_ == 0) {
     type_ = byte;
-    const bool too_short = is_payload(byte) && length_ < header_bytes(byte);
     const uint16_t payload_bytes = static_cast<uint16_t>(length_ - header_bytes(byte));
-    const bool too_long = is_payload(byte) && payload_bytes > kMostPayload;
+    const bool bad_length = is_payload(byte) && payload_bytes > kMostPayload;  // one too short wraps
     const bool bad_status = byte == kTransmitStatus && length_ != kTransmitStatusBytes;
-    if (too_short || too_long || bad_status) reject();
+    if (bad_length || bad_status) reject();
   } else if (type_ == kTransmitStatus) {
     payload_[index_ - 1] = byte;  // frame id, status
   } else if (is_payload(type_)) {

@@ -292,7 +292,6 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
     gather(sample, force, dt_s);
     if (job_ != kIdle) {  // such a step has nothing to measure against: counted, placed ahead
       job_ = kIdle;
-      step_directed_ = false;
       commit_step();
     }
     return false;
@@ -314,7 +313,7 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
     displacement_.heading_rad = bearing(ahead);
   }
   add(&heading_sum_rad_, turn_between(stance_heading_rad_, displacement_.heading_rad));
-  if (step_ticks_ < 65535u) ++step_ticks_;
+  ++step_ticks_;
 
   if (quiet_s_ >= kSettled_s) {
     if (quiet_s_ < kSettled_s + dt_s) begin_straight();
@@ -356,7 +355,7 @@ RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   closing_m_ = 0.0f;
   const float heading = displacement_.heading_rad;
   float mean = heading, turn = 0.0f, stride_turn = 0.0f;
-  if (step_ticks_ > 0 && !stance.first) {
+  if (!stance.first) {
     mean = stance_heading_rad_ + heading_sum_rad_ / static_cast<float>(step_ticks_);
     turn = turn_between(stance_heading_rad_, displacement_.heading_rad);
     stride_turn = turn + turn_rad_;
@@ -669,7 +668,7 @@ RELPOS_APART void DeadReckoning::commit_step() {
   totals_.add(way, length);
   clear(stance_position_m_);
   filter_.restart(kPosition, 0.0f);
-  if (displacement_.initialised && forward_.found() && !velocity_known_) {
+  if (forward_.found() && !velocity_known_) {
     // Switched on while walking: the speed is first known when the forward axis is.
     clear(velocity_m_s_);
     add_scaled(velocity_m_s_, walk_, step_speed_m_s_, 2);
@@ -701,7 +700,6 @@ RELPOS_APART void DeadReckoning::commit_still() {
 }
 
 RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
-  displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
   float field[kAxes];
   attitude_.matrix(rotation_);
@@ -742,7 +740,7 @@ RELPOS_APART void DeadReckoning::publish() {
   totals_.tell(Totals::kAlongX, &d.x_m);
   totals_.tell(Totals::kAlongY, &d.y_m);
   totals_.tell(Totals::kPath, &d.path_m);
-  if (d.initialised && velocity_known_ && forward_.found()) {
+  if (velocity_known_ && forward_.found()) {
     float since[2], way[2];
     memcpy(since, position_m_, sizeof since);
     add_scaled(since, stance_position_m_, 1.0f, 2);

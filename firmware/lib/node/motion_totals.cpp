@@ -106,7 +106,6 @@ RELPOS_APART RELPOS_SHARED void MotionTotals::rebase(const Displacement& last, f
   steps_ = motion.steps;
   base_heading_100urad_ = motion.heading_100urad;
   turns_ = 0;
-  previous_heading_rad_ = 0.0f;
 }
 
 }  // namespace relpos

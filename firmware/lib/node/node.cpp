@@ -276,7 +276,6 @@ RELPOS_APART void Node::tick(uint32_t now_us) {
     correct_field(settings_.calibration, field_ut);
     dead_reckoning_.magnetometer(field_ut);
     last_field_ms_ = clock_.ms();
-    field_seen_ = true;
   }
 
   const Displacement& now = dead_reckoning_.displacement();
@@ -326,7 +325,6 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
       ++work_.ranging_failures;
       ranging_error_ = result.error;
     }
-    wait = 0;
   }
   pozyx_due_us_ = now_us + (wait < kMostWaitUs ? wait : kMostWaitUs);
 }
@@ -569,7 +567,7 @@ bool Node::answer_due() const {
 // Behind the answer: writes down whose command it was, a byte a poll and last what makes it count, then
 // restarts.
 bool Node::run_reboot() {
-  if (reboot_step_ == 0 || store_.saving() || answer_due()) return false;
+  if (reboot_step_ == 0 || store_.saving()) return false;
   if (reboot_step_ > kRebootBytes) {
     board_.reset();
     reboot_step_ = 0;  // where the board outlives its reset
@@ -659,9 +657,9 @@ uint8_t Node::fill_motion(uint8_t* body) {
   wire::Motion motion = {};
   totals_.fill(now, &motion);
   const bool silent = imu_silent();
-  const bool field = field_seen_ && clock_.ms() - last_field_ms_ <= kFieldStaleMs;
+  const bool field = clock_.ms() - last_field_ms_ <= kFieldStaleMs;
   // The totals end with the last sample, not with this moment.
-  motion.time_ms = sampled_ && !silent ? last_sample_ms_ : clock_.ms();
+  motion.time_ms = !silent ? last_sample_ms_ : clock_.ms();
   if (field && now.magnetic_heading_valid) {
     motion.magnetic_heading_100urad =
         static_cast<int16_t>(scaled(now.magnetic_heading_rad, 10000));

@@ -68,7 +68,6 @@ struct NodeState : Persistent {
   uint32_t updates_;  // of the dead reckoning since its reset
   uint16_t seen_steps_;
   uint8_t quality_;  // gathered since the last motion message
-  bool field_seen_;
   bool sampled_;  // ever
   uint32_t pozyx_due_us_;
   RangingPlan plan_;
