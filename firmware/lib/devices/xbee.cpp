@@ -144,7 +144,8 @@ RELPOS_SHARED void Xbee::take_data(uint8_t byte) {
   if (index_ == 0) {
     type_ = byte;
     const uint16_t payload_bytes = static_cast<uint16_t>(length_ - header_bytes(byte));
-    const bool bad_length = is_payload(byte) && payload_bytes > kMostPayload;  // one too short wraps
+    // One too short for its header wraps.
+    const bool bad_length = is_payload(byte) && payload_bytes > kMostPayload;
     const bool bad_status = byte == kTransmitStatus && length_ != kTransmitStatusBytes;
     if (bad_length || bad_status) reject();
   } else if (type_ == kTransmitStatus) {

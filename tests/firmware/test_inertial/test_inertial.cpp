@@ -221,7 +221,7 @@ TEST(the_first_steps_after_a_turn_on_the_spot_go_where_one_faces) {
   CHECK(y > 0.2f && fabsf(x) < 0.2f * y);
 }
 
-// The share of the way that a walk's steps may err by together, and whether it is flagged at its end.
+// The share of the way that a walk's steps may err by together, and whether it ends flagged.
 struct Doubt {
   float scale, path_m;
   bool flagged;
@@ -271,9 +271,11 @@ TEST(a_limp_bobs_too_small_or_large_and_turning_on_the_spot_make_steps_doubtful)
 
 TEST(a_field_that_cannot_be_the_earths_gives_no_heading) {
   for (uint8_t which = 0; which < 6; ++which) {
-    // Up, left, back, of 50 uT: too weak, too strong; after two seconds of the right one.
-    const float fields_ut[][3] = {{-7.0f, 7.0f, -15.0f}, {-55.0f, 7.0f, -55.0f}, {-40.0f, 7.0f, -44.2f},
-                                  {-30.0f, 7.0f, -30.0f}, {-45.0f, 7.0f, -20.7f}, {-40.0f, 7.0f, -29.15f}};
+    // Up, left, back. Too weak, too strong; of another norm, vertical, or both, after two seconds
+    // of the right one; and that one.
+    const float fields_ut[][3] = {{-7.0f, 7.0f, -15.0f},  {-55.0f, 7.0f, -55.0f},
+                                  {-40.0f, 7.0f, -44.2f}, {-30.0f, 7.0f, -30.0f},
+                                  {-45.0f, 7.0f, -20.7f}, {-40.0f, 7.0f, -29.15f}};
     const float right_ut[3] = {-40.0f, 7.0f, -29.15f};
     walk(0.4f);
     const Displacement& d = reckoning.displacement();

@@ -1268,7 +1268,8 @@ TEST(a_calibrated_sensor_has_lower_limits_and_a_surer_gyroscope) {
       (spins ? team.world.rate : team.world.force) = 31500;
       team.run(again, 1500);
       CHECK(team.read(wire::MessageType::kMotion, &walked));
-      CHECK_EQUAL(calibrated, (walked.quality & static_cast<uint8_t>(wire::Quality::kSaturated)) != 0);
+      const uint8_t saturated = static_cast<uint8_t>(wire::Quality::kSaturated);
+      CHECK_EQUAL(calibrated, (walked.quality & saturated) != 0);
     }
   }
   CHECK(of[1].variance_heading_100urad2 * 20.0f < of[0].variance_heading_100urad2);
@@ -1406,7 +1407,9 @@ TEST(a_setting_that_is_as_it_was_wears_no_storage_and_a_gain_has_one_more_versio
   ask(team, team.node, wire::CommandCode::kSetStepGainPermille, 2000);
   CHECK_EQUAL(2, versions());
   const uint16_t settings = relpos::kStoredRecords + relpos::stored_bytes(sizeof(relpos::Marks));
-  for (uint16_t at = settings; at < relpos::kStorageBytes; ++at) CHECK_EQUAL(0, team.world.writes[at]);
+  for (uint16_t at = settings; at < relpos::kStorageBytes; ++at) {
+    CHECK_EQUAL(0, team.world.writes[at]);
+  }
 }
 
 TEST(gain_and_leg_are_in_force_at_once_and_a_gain_is_surer_than_that_of_everybody) {
@@ -1536,7 +1539,7 @@ TEST(a_reboot_is_acknowledged_first_and_not_repeated_by_the_same_command) {
 }
 
 TEST(no_other_command_is_taken_while_a_restart_is_written_down) {
-  for (const uint8_t before : {0, 3}) {  // commands, so that the reboot is the first or the last kept
+  for (const uint8_t before : {0, 3}) {  // commands: the reboot is the first or the last kept
     Team team;
     team.world.storage_us = 3400;
     team.run_ms(500);
