@@ -153,7 +153,8 @@ def test_tum_comes_back_as_it_went(tmp_path: Path) -> None:
     expected = sorted(run().truth, key=lambda t: (t.time_s, t.node))
     assert [(t.time_s, t.node) for t in truth] == [(t.time_s, t.node) for t in expected]
     for was, now in zip(expected, truth, strict=True):
-        assert (was.x_m, was.y_m) == pytest.approx((now.x_m, now.y_m), abs=1e-6)
+        there, back = ((t.x_m, t.y_m, t.z_m, t.heading_rad) for t in (was, now))
+        assert there == pytest.approx(back, abs=1e-6)
 
 
 def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> None:
@@ -169,7 +170,7 @@ def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> No
             qw, qx = math.cos(half) * math.cos(pitch), -math.sin(half) * math.sin(pitch)
             qy, qz = math.cos(half) * math.sin(pitch), math.sin(half) * math.cos(pitch)
             lines.append(f"{START_UNIX_S + second} {x_m + 5.0} {y_m} 1.5 {qx} {qy} {qz} {qw}")
-        (tmp_path / "slam" / f"kf_{node}.tum").write_text("# kf\n" + "\n".join(lines))
+        (tmp_path / "slam" / f"kf_{node}.tum").write_text("# kf\n\n" + "\n".join(lines))
     slam = tmp_path / "slam"
     convert(slam, "--as", "estimate", "--start", START, "--to", "run", "--out", tmp_path / "est")
     result = CommandResult("evaluate", yard, "--estimate", tmp_path / "est", "--json")
@@ -181,6 +182,9 @@ def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> No
     one = slam / "kf_2.tum"
     words = ("--as", "truth", "--node", 7, "--start", str(START_UNIX_S), "--run", yard)
     convert(one, *words, "--to", "run", "--out", tmp_path / "with-truth")
+    assert "node 7's truth is in kf_1.tum already" in refused(
+        slam, *words, "--to", "run", "--out", tmp_path / "twice"
+    )
     laid = load_run(tmp_path / "with-truth")
     assert {row.node for row in laid.truth} == {7}
     assert laid.motions == load_run(yard).motions
@@ -198,6 +202,8 @@ def test_guesses_are_reported_and_may_be_left_out(tmp_path: Path) -> None:
         for line in (tmp_path / "some" / "estimate_3.tum").read_text().splitlines()
     )
     assert rows[False] == SECONDS - 10
+    words = ("--pin", "48,11,0@3:5", "--to", "geojson", "--out", tmp_path / "map.geojson")
+    assert "node 3 was not located at 5 s" in refused(tmp_path / "fused", *words)
 
 
 def test_a_truth_without_headings_says_so(tmp_path: Path) -> None:
@@ -206,6 +212,13 @@ def test_a_truth_without_headings_says_so(tmp_path: Path) -> None:
     result = convert(tmp_path / "yard", "--to", "tum", "--out", tmp_path / "t")
     assert any("without a heading" in line for line in result.remarks)
     assert result.files == [tmp_path / "t" / "truth_1.tum"]
+    path = tmp_path / "map.geojson"
+    convert(tmp_path / "yard", "--pin", PIN, "--to", "geojson", "--out", path)
+    assert features(path, kind="track")[0]["properties"]["course_deg"] == [None, None]
+    convert(tmp_path / "yard", "--to", "csv", "--out", tmp_path / "c")
+    ranges = (tmp_path / "c" / "ranges.csv").read_text("utf-8").splitlines()
+    assert ranges[0].endswith(",true_distance_m")
+    assert ranges[1].endswith(",")  # Of node 2 no truth is known.
 
 
 def test_a_truth_without_heights_says_so(tmp_path: Path) -> None:
@@ -283,6 +296,7 @@ def test_the_files_of_a_live_session_are_converted_with_its_recording(tmp_path: 
     save_run(run(truth=False), tmp_path / "live" / "received")
     convert(tmp_path / "live", "--to", "csv", "--out", tmp_path / "tables")
     assert "Kim" in (tmp_path / "tables" / "estimate.csv").read_text("utf-8")
+    assert "true_distance_m" not in (tmp_path / "tables" / "pairs.csv").read_text("utf-8")
     assert load_run(tmp_path / "tables").motions == run().motions
 
 
@@ -292,7 +306,8 @@ def test_the_files_of_a_live_session_are_converted_with_its_recording(tmp_path: 
 def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> None:
     yard, fused = written(tmp_path)
     path = tmp_path / "walk.mcap"
-    convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
+    words = ("--run", yard, "--start", START, "--to", "mcap", "--out", path)
+    assert not convert(fused, *words).remarks
     result = convert(path, "--to", "csv", "--out", tmp_path / "tables")
     assert not result.remarks
     back, was = load_run(tmp_path / "tables"), load_run(yard)
@@ -321,9 +336,9 @@ def test_the_status_of_a_pair_comes_back_from_a_recording(tmp_path: Path) -> Non
 
 def test_a_recording_without_a_start_says_when_its_clock_begins(tmp_path: Path) -> None:
     yard, _ = written(tmp_path)
-    result = convert(yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")
+    result = convert(yard, "--to", "mcap", "--out", tmp_path / "walk")  # known without a suffix
     assert any("begins in 1970" in line for line in result.remarks)
-    convert(tmp_path / "walk.mcap", "--to", "run", "--out", tmp_path / "back")
+    convert(tmp_path / "walk", "--to", "run", "--out", tmp_path / "back")
     assert load_run(tmp_path / "back").measurements == load_run(yard).measurements
 
 
@@ -361,6 +376,7 @@ def test_a_recording_in_which_nothing_is_gives_no_run(tmp_path: Path, content: b
 def test_a_recording_is_not_left_half_written(tmp_path: Path) -> None:
     yard, _ = written(tmp_path)
     path = tmp_path / "walk.mcap"
+    (tmp_path / "walk.mcap.part").write_bytes(b"of a conversion that was killed")
     convert(yard, "--start", START, "--to", "mcap", "--out", path)
     before = path.read_bytes()
     assert "--overwrite" in refused(yard, "--to", "mcap", "--out", path)
@@ -422,6 +438,7 @@ def features(path: Path, **wanted: object) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("form", ["geojson", "gpx"])
 def test_a_map_comes_back_to_the_millimetre(tmp_path: Path, form: str) -> None:
     yard, fused = written(tmp_path)
+    save_run(replace(run(), landmarks=LANDMARKS[1:]), yard)
     path = tmp_path / f"map.{form}"
     words = ("--pin", PIN, "--start", START)
     convert(fused, "--run", yard, *words, "--to", form, "--out", path)
@@ -436,6 +453,9 @@ def test_a_map_comes_back_to_the_millimetre(tmp_path: Path, form: str) -> None:
     for row in truth:
         x_m, y_m, _ = true_pose(row.node, row.time_s)
         assert math.dist((row.x_m, row.y_m), (x_m, y_m)) < 2e-3
+    (mark,) = load_run(tmp_path / "back").landmarks
+    assert mark.landmark == "18"
+    assert (mark.x_m, mark.y_m, mark.z_m) == pytest.approx((10.0, 4.5, 3.25), abs=1e-3)
 
 
 def test_geojson_is_what_the_rfc_asks_for(tmp_path: Path) -> None:
@@ -540,14 +560,16 @@ def test_a_track_has_a_gap_where_a_node_was_not_located(tmp_path: Path, form: st
         assert shapes == ["LineString", "Point", "LineString"]
 
 
-@pytest.mark.parametrize(("off_m", "pieces"), [(2.0, 1), (6.0, 3)])
+@pytest.mark.parametrize(("off_m", "period_s", "pieces"), [(2, 1, 1), (2, 0.25, 1), (6, 1, 3)])
 def test_no_line_crosses_the_map_where_somebody_was_located_anew(
-    tmp_path: Path, off_m: float, pieces: int
+    tmp_path: Path, off_m: float, period_s: float, pieces: int
 ) -> None:
     lost = [
-        replace(e, nodes=tuple(replace(n, x_m=n.x_m + off_m) for n in e.nodes))
-        if 10.0 <= e.time_s < 20.0
-        else e
+        replace(
+            e,
+            time_s=e.time_s * period_s,
+            nodes=tuple(replace(n, x_m=n.x_m + off_m * (10.0 <= e.time_s < 20.0)) for n in e.nodes),
+        )
         for e in estimates()
     ]
     write_estimates(tmp_path / "fused", lost)
@@ -562,9 +584,12 @@ def test_the_page_cuts_a_track_at_the_same_jump() -> None:
     assert float(figures["FASTEST_M_S"]) == content.FASTEST_M_S
 
 
-def test_truth_in_another_frame_is_left_out_of_the_map(tmp_path: Path) -> None:
-    save_run(replace(run(priors=False), landmarks=LANDMARKS), tmp_path / "yard")
-    write_estimates(tmp_path / "fused", estimates())
+@pytest.mark.parametrize(("known", "told"), [(False, None), (True, ())])
+def test_truth_in_another_frame_is_left_out_of_the_map(
+    tmp_path: Path, known: bool, told: tuple[()] | None
+) -> None:
+    save_run(replace(run(priors=known), landmarks=LANDMARKS), tmp_path / "yard")
+    write_estimates(tmp_path / "fused", estimates(), priors=told)
     words = ("--run", tmp_path / "yard", "--pin", PIN, "--to", "geojson")
     result = convert(tmp_path / "fused", *words, "--out", tmp_path / "map.geojson")
     assert any("the truth is left out" in line for line in result.remarks)
@@ -572,6 +597,23 @@ def test_truth_in_another_frame_is_left_out_of_the_map(tmp_path: Path) -> None:
         "estimate"
     }
     assert not features(tmp_path / "map.geojson", kind="landmark")
+
+
+def test_a_track_of_another_tool_may_have_absolute_times(tmp_path: Path) -> None:
+    _, fused = written(tmp_path)
+    path = tmp_path / "map.geojson"
+    convert(fused, "--pin", PIN, "--start", START, "--to", "geojson", "--out", path)
+    document = json.loads(path.read_text("utf-8"))
+    for feature in document["features"]:
+        feature["properties"].pop("time_s", None)
+        feature["properties"].pop("of", None)
+    path.write_text(json.dumps(document), "utf-8")
+    # And a place whose altitude and bearing are not known.
+    words = ("--as", "estimate", "--pin", "48.137,11.575", "--to", "run", "--out")
+    result = convert(path, *words, tmp_path / "back", "--start", START)
+    assert any("east" in line for line in result.remarks)
+    assert [e.time_s for e in read_estimates(tmp_path / "back")] == [e.time_s for e in estimates()]
+    assert "say when the run's second 0 was" in refused(path, *words, tmp_path / "no")
 
 
 def test_a_pin_may_lie_where_a_node_was(tmp_path: Path) -> None:
@@ -687,6 +729,13 @@ def test_a_second_truth_is_not_laid_over_the_first(tmp_path: Path, pressed: Path
 
 # -- what is wrong ---------------------------------------------------------------------------------
 
+GPX, MINE = '<gpx version="1.1">{}</gpx>', ("--as", "truth", "--node", "1")
+HERE = '<trkpt lat="48.137" lon="11.575"></trkpt>'
+FAR = '<trkpt lat="11.575" lon="48.137"><time>2026-05-04T09:30:00Z</time></trkpt>'
+MARK = '<wpt lat="48.137" lon="11.575"><name>{}</name></wpt>'
+COLLECTION = '{{"type":"FeatureCollection","features":[{}]}}'
+SEVEN = '{"type":"Feature","id":7,"geometry":{"type":"Point","coordinates":[11.575,48.137]}}'
+
 
 @pytest.mark.parametrize(
     ("name", "content", "words", "complaint"),
@@ -701,11 +750,21 @@ def test_a_second_truth_is_not_laid_over_the_first(tmp_path: Path, pressed: Path
         ("estimate_1.tum", "# nothing\n", (), "no pose in it"),
         ("estimate.tum", "1 2 3 0 0 0 0 1\n", (), "which node's trajectory"),
         ("a.gpx", "<gpx", (), "not GPX"),
+        ("a.gpx", GPX.format("<trk></trk>"), (), "track 1: whose track is this"),
+        ("a.gpx", GPX.format("<trk><number>1</number></trk>"), (), "truth or an estimate"),
+        ("a.gpx", GPX.format(f"<trk><trkseg>{HERE}</trkseg></trk>"), MINE, "a point has no time"),
+        ("a.gpx", GPX.format(f"<trk><trkseg>{FAR}</trkseg></trk>"), MINE, "longitude swapped"),
+        ("a.gpx", GPX.format(MARK.format("")), (), "waypoint 1: a landmark needs a name"),
+        ("a.gpx", GPX.format(2 * MARK.format("A")), (), "landmark 'A' is there twice"),
         ("a.gpx", "<gpx/>", (), "neither tracks nor landmarks"),
         ("a.geojson", "{", (), "line 1: not JSON"),
         ("a.geojson", "[]", (), "neither a FeatureCollection nor a Feature"),
         ("a.txt", "", (), "of what format is it? (--from"),
         ("a.geojson", '{"type":"FeatureCollection","features":[3]}', (), "feature 1: no GeoJSON"),
+        ("a.geojson", COLLECTION.format(f"{SEVEN},{SEVEN}"), (), "'7' is there twice"),
+        pytest.param("a.geojson", "[" * 100_000, (), "nested too deeply", id="deep"),
+        ("a.geojson", '{"type":"Feature","geometry":3}', (), "no GeoJSON geometry"),
+        ("a.geojson", '{"type":"Feature","geometry":null}', (), "neither tracks nor landmarks"),
     ],
 )
 def test_a_wrong_file_is_reported_in_one_line(
@@ -725,6 +784,13 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
     ("shape", "coordinates", "properties", "complaint"),
     [
         ("LineString", "[[11,48],[11,48]]", "{}", "whose track is this"),
+        ("Polygon", "[[]]", "{}", "a track is a LineString, not a Polygon"),
+        (
+            "LineString",
+            "[[11.575,48.137],[11.575,48.137]]",
+            '{"node":1,"of":"estimate","time_s":[1,1]}',
+            "node 1 has two positions at 1 s",
+        ),
         ("LineString", "[[11,48],[11,48]]", '{"node":1}', "truth or an estimate"),
         ("LineString", "[[11.5,48],[11,48]]", '{"node":1,"of":"truth"}', "a time for each"),
         (
@@ -802,6 +868,11 @@ def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:
     assert "no such file" in refused(tmp_path / "nowhere", "--to", "tum", "--out", out)
     (tmp_path / "empty").mkdir()
     assert "neither a run nor" in refused(tmp_path / "empty", "--to", "tum", "--out", out)
+    words = ("--from", "tum", "--to", "run", "--out", out)
+    assert "no trajectories" in refused(tmp_path / "empty", *words)
+    assert "no such file" in refused(tmp_path / "nowhere", *words)
+    (tmp_path / "a.gpx").touch()
+    assert "neither a run directory nor" in refused(fused, "--run", tmp_path / "a.gpx", *words)
     assert "SOURCE itself" in refused(yard, "--to", "run", "--out", yard)
     save_run(run(truth=False), tmp_path / "unfused")
     assert "fuse it first" in refused(tmp_path / "unfused", "--to", "tum", "--out", out)

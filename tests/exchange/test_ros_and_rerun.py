@@ -67,13 +67,14 @@ def test_rosbags_reads_the_bag_and_finds_the_poses_with_their_covariances(
     for (node, at_s), n in expected.items():
         pose = found[node, round(at_s, 3)]
         place, turn = pose.pose.position, pose.pose.orientation
-        assert (place.x, place.y) == pytest.approx((n.x_m, n.y_m))
+        assert (place.x, place.y, place.z) == pytest.approx((n.x_m, n.y_m, n.z_m))
         assert math.remainder(
             2 * math.atan2(turn.z, turn.w) - n.heading_rad, math.tau
         ) == pytest.approx(0.0, abs=1e-9)
         covariance = pose.covariance.reshape(6, 6)
         assert covariance[0, 0] == pytest.approx(n.variance_x_m2)
         assert covariance[0, 1] == covariance[1, 0] == pytest.approx(n.covariance_xy_m2)
+        assert covariance[2, 2] == pytest.approx(n.sigma_z_m**2)
         assert covariance[5, 5] == pytest.approx(n.sigma_heading_rad**2)
     assert {"/tf", "/relpos/node_1/odometry", "/relpos/node_1/truth"} <= topics
 
@@ -85,6 +86,7 @@ def test_the_mcap_support_of_ros_reads_ranges_odometry_and_transforms(
     run = load_run(team[0])
     ranges: list[tuple[float, int, int, float]] = []
     last: dict[int, Any] = {}
+    truth = {}
     frames = set()
     for item in mcap_ros2.read_ros2_messages(str(next(bag.glob("*.mcap")))):
         message, words = item.ros_msg, item.channel.topic.split("/")
@@ -92,6 +94,8 @@ def test_the_mcap_support_of_ros_reads_ranges_odometry_and_transforms(
         if words[-1].startswith("range_to"):
             node, peer = int(words[2].split("_")[1]), int(words[3].split("_")[2])
             ranges.append((at_s, node, peer, round(message.range, 3)))
+        elif words[-1] == "truth":
+            truth[at_s, int(words[2].split("_")[1])] = message.pose
         elif words[-1] == "odometry":
             last[int(words[2].split("_")[1])] = message
         elif words[-1] == "tf":
@@ -99,6 +103,11 @@ def test_the_mcap_support_of_ros_reads_ranges_odometry_and_transforms(
     expected = [(round(r.time_s, 3), r.node, r.peer, round(r.range_m, 3)) for r in run.ranges]
     assert sorted(ranges) == sorted(expected)
     assert ("map", "node_1") in frames
+    for t in run.truth:
+        place, turn = truth[t.time_s, t.node].position, truth[t.time_s, t.node].orientation
+        yaw_rad = 2 * math.atan2(turn.z, turn.w)
+        told = (place.x, place.y, place.z, math.remainder(yaw_rad, math.tau))
+        assert told == pytest.approx((t.x_m, t.y_m, t.z_m, t.heading_rad))
     # Displacements one after the other, with complex numbers.
     at: dict[int, complex] = defaultdict(complex)
     heading: dict[int, float] = defaultdict(float)
@@ -112,6 +121,8 @@ def test_the_mcap_support_of_ros_reads_ranges_odometry_and_transforms(
         place = message.pose.pose.position
         assert complex(place.x, place.y) == pytest.approx(at[node])
         assert message.child_frame_id == f"node_{node}"
+        twist = message.twist.twist
+        assert (twist.linear.x, twist.angular.z) == pytest.approx((0.9, 0.1))
 
 
 def test_a_failed_range_is_infinite_in_a_bag_as_rep_117_has_it(tmp_path: Path) -> None:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relpos import tracks
 from relpos.errors import DataError
 from relpos.exchange.formats import Kind
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import Locate, MapFrame
 from relpos.measurements import Prior, Truth
 from relpos.runs.run import Run
-from relpos.tracks import Track, sample
+from relpos.tracks import located_tracks, sample, true_tracks
 
 if TYPE_CHECKING:
     from relpos.recording.reader import Recording
@@ -58,23 +57,12 @@ class Content:
 
     def name_of(self, node: int) -> str:
         """Return the wearer's name, or the node's number in words."""
-        return name_of(node, self.names)
-
-    @property
-    def names(self) -> dict[int, str]:
-        """The wearers' names, where there are any."""
-        return self.run.description.names
-
-    def tracks_of(self, kind: Kind) -> dict[int, Track]:
-        """Return each node's trajectory; a guess at a node not located yet is part of it."""
-        if kind is Kind.TRUTH:
-            return tracks.true_tracks(self.run.truth)
-        return tracks.estimated_tracks(self.estimates)
+        return self.run.description.names.get(node) or f"node {node}"
 
     def locate(self, kind: Kind) -> Locate:
         """Return where a node was at a time, or first, for a pin that is stuck to a node."""
         found = (
-            self.tracks_of(kind) if kind is Kind.TRUTH else tracks.located_tracks(self.estimates)
+            true_tracks(self.run.truth) if kind is Kind.TRUTH else located_tracks(self.estimates)
         )
 
         def at(node: int, time_s: float | None) -> tuple[float, float] | None:
@@ -98,11 +86,6 @@ class Content:
         if self.priors is not None:
             return bool(self.priors)
         return bool(self.run.description.priors) or self.run.description.initial_pose != "unknown"
-
-
-def name_of(node: int, names: Mapping[int, str]) -> str:
-    """Return the wearer's name, or the node's number in words."""
-    return names.get(node) or f"node {node}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,26 +96,28 @@ def _base(source: Path, hints: Hints) -> Content:
         return _read_mcap(hints.run)
     if form is not Format.RUN:
         raise DataError(f"{hints.run}: neither a run directory nor a recording")
-    run = load_run(hints.run)
+    return _of_run(hints.run)
+
+
+def _of_run(directory: Path) -> Content:
+    run = load_run(directory)
     return Content(run, remarks=_press_remarks(run))
 
 
 def _read_directory(source: Path, hints: Hints) -> Content:
     estimates = tuple(read_estimates(source)) if find_table(source, "estimate.csv") else ()
     priors = read_initial(source) if estimates else None
-    if hints.run is not None:
-        base = _base(source, hints)
-        return (
-            base
-            if not estimates
-            else replace(base, estimates=estimates, priors=priors, recording=None)
-        )
     received = source / RECEIVED
-    if estimates and received.is_dir():
-        run = load_run(received)
-        return Content(replace(run, name=source.resolve().name), estimates, priors=priors)
-    run = load_run(source)
-    return Content(run, estimates, remarks=_press_remarks(run), priors=priors)
+    if hints.run is not None:
+        content = _base(source, hints)
+    elif estimates and received.is_dir():
+        content = _of_run(received)
+        content = replace(content, run=replace(content.run, name=source.resolve().name))
+    else:
+        content = _of_run(source)
+    if not estimates:
+        return content
+    return replace(content, estimates=estimates, priors=priors, recording=None)
 
 
 def _press_remarks(run: Run) -> tuple[str, ...]:
@@ -337,7 +339,7 @@ def _write_run(content: Content, out: Path) -> _Written:
     save_run(content.run, out)
     if content.estimates:
         write_estimates(out, content.estimates, steps=content.run.steps, priors=content.priors)
-    return sorted(path for path in out.iterdir() if path.is_file()), []
+    return sorted(out.iterdir()), []
 
 
 def _write_csv(content: Content, out: Path) -> _Written:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from datetime import UTC
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from relpos.runs.table import read_text
 
 def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
     """Write all tracks and landmarks; elevations only where the pin gave an altitude."""
-    gpx = _library()
+    gpx = _library().gpx
     document = gpx.GPX()
     document.creator = "relpos"
     document.name = printable(content.run.name)
@@ -54,7 +54,7 @@ def first_time(path: Path) -> float | None:
     """Return the Unix time of the file's first point in time; None where it has no times."""
     document = _parsed(path)
     times = [
-        p.time.replace(tzinfo=p.time.tzinfo or UTC).timestamp()
+        _unix_s(p.time)
         for track in document.tracks
         for segment in track.segments
         for p in segment.points
@@ -89,9 +89,8 @@ def read_tracks(
             for p in segment.points:
                 if p.time is None:
                     raise DataError(f"{where}: a point has no time")
-                time = p.time.replace(tzinfo=p.time.tzinfo or UTC)
                 x_m, y_m, z_m = _world(where, p, frame)
-                time_s = round(time.timestamp() - (start_unix_s or 0.0), 6)
+                time_s = round(_unix_s(p.time) - (start_unix_s or 0.0), 6)
                 points.setdefault(what, []).append(Point(time_s, whose, x_m, y_m, z_m))
     return points
 
@@ -111,6 +110,10 @@ def read_landmarks(path: Path, frame: MapFrame) -> list[Landmark]:
     return list(landmarks.values())
 
 
+def _unix_s(time: datetime) -> float:
+    return time.replace(tzinfo=time.tzinfo or UTC).timestamp()
+
+
 def _world(where: str, point: Any, frame: MapFrame) -> tuple[float, float, float]:
     try:
         x_m, y_m = frame.to_world(point.latitude, point.longitude)
@@ -123,10 +126,7 @@ def _world(where: str, point: Any, frame: MapFrame) -> tuple[float, float, float
 
 
 def _parsed(path: Path) -> Any:
-    _library()
-    import gpxpy
-    import gpxpy.gpx
-
+    gpxpy = _library()
     text = read_text(path)
     try:
         return gpxpy.parse(text)
@@ -139,4 +139,4 @@ def _library() -> Any:
         import gpxpy.gpx
     except ImportError:
         raise missing_extra("gpxpy", "exchange") from None
-    return gpxpy.gpx
+    return gpxpy

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.exchange.content import PLACED, Content, Point, name_of, stretches_of
+from relpos.exchange.content import PLACED, Content, Point, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeEstimate
@@ -57,7 +57,7 @@ class _Writer:
                 points = [p for piece in pieces for p in piece]
                 columns = self._rerun.Points3D.columns(
                     positions=[_xyz(p) for p in points],
-                    labels=[name_of(node, self._content.names)] * len(points),
+                    labels=[self._content.name_of(node)] * len(points),
                 )
                 self._send(f"{root}/node_{node}", [p.time_s for p in points], columns)
                 strips = [[_xyz(p) for p in piece] for piece in pieces if len(piece) > 1]

@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from relpos.exchange.content import Content
-from relpos.exchange.formats import Kind
 from relpos.runs.appending import write_rows
 from relpos.runs.estimates import write_estimates
 from relpos.runs.run import TABLE_NAMES, save_run
-from relpos.tracks import Track, sample
+from relpos.tracks import Track, sample, true_tracks
 
 _OF_PAIRS = ("pairs.csv", "ranges.csv")
 _AS_THEY_ARE = ("landmarks.csv", "imu.csv")
@@ -35,7 +34,7 @@ def write_tables(content: Content, directory: Path) -> list[Path]:
     if content.estimates:
         written |= {*write_estimates(directory, content.estimates, steps=content.run.steps)}
     paths = sorted(written)
-    true = content.tracks_of(Kind.TRUTH)
+    true = true_tracks(content.run.truth)
     for path in paths:
         if path.name not in _AS_THEY_ARE:
             _extend(path, content, true)
