@@ -1,5 +1,7 @@
 """What a boot loader is asked, where no simulated board is needed to see it."""
 
+from functools import reduce
+from operator import xor
 from types import SimpleNamespace
 
 import pytest
@@ -23,6 +25,7 @@ class LateMega:
         self.answer = b""
 
     def write(self, frame):
+        assert reduce(xor, frame) == 0
         command, told = frame[5], frame[5:-1]
         body = bytes((command, 0))
         if command == LOADS_ADDRESS:
@@ -31,10 +34,7 @@ class LateMega:
             size = int.from_bytes(told[1:3], "big")
             body += self.flash[self.at : self.at + size] + b"\0"
         answer = bytes((0x1B, frame[1], *len(body).to_bytes(2, "big"), 0x0E)) + body
-        check = 0
-        for byte in answer:
-            check ^= byte
-        self.answer = answer + bytes((check,))
+        self.answer = answer + bytes((reduce(xor, answer),))
 
     def read(self, size):
         self.now_s += READ_S

@@ -169,4 +169,6 @@ def test_a_restart_whose_cause_the_boot_loader_hides_is_reported_and_a_first_sta
 def test_a_recorded_cause_of_a_restart_that_nobody_knows_is_unknown(value):
     view = TeamMonitor()
     view.update_without_link(1.0, [Status(1.0, 5, "reset_cause", value)])
-    assert view.rows(1.0)[0]["reset_cause"] == "unknown"
+    (row,) = view.rows(3.0)
+    assert row["reset_cause"] == "unknown"
+    assert row["seen_s"] == 2.0

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from relpos.nodes.settings import SETTINGS, parse_changes
+from relpos.nodes.settings import BY_NAME, SETTINGS, parse_changes
 from relpos.protocol.messages import CommandCode
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +28,10 @@ def test_a_stature_stands_for_its_leg_length():
     assert changes("stature", "1.80") == [("leg-length", 954)]
 
 
+def test_a_word_that_only_newer_firmware_knows_is_shown_as_its_number():
+    assert [BY_NAME["led"].shown(raw) for raw in (2, 3)] == ["health", "3"]
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -40,6 +44,7 @@ def test_a_stature_stands_for_its_leg_length():
         (("team-size", "3.5"), "whole steps of 1"),
         (("leg-length", "nan"), "between"),
         (("stature", "180"), "between 1 and 2.4 m"),
+        (("stature", "tall"), "stature 'tall': not a number"),
         (("led", "on", "leg-length", "9"), "between 0.4 and 1.4 m"),
     ],
 )

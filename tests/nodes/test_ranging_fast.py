@@ -1,11 +1,14 @@
-"""Two nodes that range twice a second while their offsets are measured."""
+"""Two nodes whose range offsets are read, measured and stored."""
 
 from __future__ import annotations
+
+from collections import deque
+from types import SimpleNamespace
 
 import pytest
 
 from relpos.errors import DeviceError
-from relpos.nodes.antenna import FAST_PERIOD_MS, ranging_fast
+from relpos.nodes.antenna import FAST_PERIOD_MS, ranging_fast, read_offsets_mm, store_offsets_mm
 from relpos.protocol.messages import CommandCode
 
 
@@ -38,3 +41,26 @@ def test_a_node_gets_its_ranging_period_back_also_where_the_other_has_fallen_sil
     with pytest.raises(DeviceError, match=r"--node 1 ranging-period 1\.5$"):
         measure()
     assert nodes.periods_ms == {1: FAST_PERIOD_MS, 2: 1000}
+
+
+def test_offsets_are_subtracted_from_the_next_range_on_once_they_are_read_or_stored() -> None:
+    class Calibrated(Nodes):
+        """Nodes of which node 2 stores nothing beyond a metre."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.link = SimpleNamespace(decoder=SimpleNamespace(range_offsets_m={}))
+            self.observations = deque(["a range before"])
+
+        def demand(self, code: CommandCode, value: int) -> int:
+            return super().demand(code, min(value, 1000) if self.node == 2 else value)
+
+    nodes = Calibrated()
+    told: dict[int, float] = nodes.link.decoder.range_offsets_m
+    assert read_offsets_mm(nodes, (1, 2)) == (1500, 1000)  # type: ignore[arg-type]
+    assert told == {1: 1.5, 2: 1.0}
+    assert not nodes.observations
+    store_offsets_mm(nodes, (1, 2), (-20, 30))  # type: ignore[arg-type]
+    assert told == {1: -0.02, 2: 0.03}
+    with pytest.raises(DeviceError, match="node 2 has stored an offset of 1000 mm instead of 1500"):
+        store_offsets_mm(nodes, (1, 2), (0, 1500))  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ Meaning of the parameters: Digi's 802.15.4 manual, from memory: check.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -228,7 +228,7 @@ def find_module(open_at: Callable[[int], serial.Serial]) -> Access:
     Tries what the project sets, then what the shelf has, then everything else.
     """
     for baud in dict.fromkeys((BAUD, FACTORY_BAUD, 115200, 57600, 19200, 4800, 2400, 1200)):
-        for access in _attempts(open_at(baud)):
+        if (access := _answering(open_at(baud))) is not None:
             return access
     raise DeviceError(
         "no XBee module answers on this port: is it in a USB adapter of its own (on a node's "
@@ -236,17 +236,16 @@ def find_module(open_at: Callable[[int], serial.Serial]) -> Access:
     )
 
 
-def _attempts(device: serial.Serial) -> Iterator[Access]:
-    """The module as it answers at this speed; nothing, and the device closed, where it does not."""
+def _answering(device: serial.Serial) -> Access | None:
+    """The module as it answers at this speed; None, and the device closed, where it does not."""
     api = ApiMode(device)
     if api.answers():
-        yield api
-        return
+        return api
     text = CommandMode(device)
     if text.enter():
-        yield text
-        return
+        return text
     device.close()
+    return None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,7 +41,7 @@ class Setting:
             raise ValueError(f"{self.name} '{text}': not a number") from None
         if self.off and value == 0.0:
             return 0
-        if not self.low <= value <= self.high or not math.isfinite(value):
+        if not self.low <= value <= self.high:
             or_off = ", or off" if self.off else ""
             raise ValueError(f"{self.name} {text}: {self.limits()}{or_off}")
         raw = round(value * self.per_unit)

@@ -72,13 +72,10 @@ class Recording:
 
 def record(dialogue: NodeDialogue) -> Recording:
     """Take raw samples for some seconds."""
-    samples: list[RawSample] = []
     try:
-        samples += [sample for sample in dialogue.raw_samples(RECORD_S) if sample is not None]
-    except DeviceError:
-        if not samples:
-            return Recording(())
-    return Recording(samples)
+        return Recording([s for s in dialogue.raw_samples(RECORD_S) if s is not None])
+    except DeviceError:  # It has fallen silent, whatever came before.
+        return Recording(())
 
 
 def sample_findings(
