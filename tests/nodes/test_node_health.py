@@ -172,3 +172,29 @@ def test_a_recorded_cause_of_a_restart_that_nobody_knows_is_unknown(value):
     (row,) = view.rows(3.0)
     assert row["reset_cause"] == "unknown"
     assert row["seen_s"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("grown", "words"),
+    [
+        ({"ranging_successes": 1, "ranging_failures": 19}, "5 % of rangings succeed"),
+        ({"missed_ticks": 3}, "3 ticks missed"),
+        ({"refused_frames": 2}, "2 forged or repeated frames rejected"),
+        ({"damaged_bytes": 5}, "5 bytes damaged on the way from the XBee"),
+        ({"lost_bytes": 4}, "4 received bytes lost"),
+        ({"neighbours": 0, "team": 3}, "no peer in range"),
+        ({"free_stack_bytes": 40}, "40 bytes of stack left"),
+        ({"battery_v": 4.2}, "supply 4.20 V"),
+        ({"uptime_s": 20.0, "reset_cause": wire.ResetCause.WATCHDOG}, "restarted (watchdog)"),
+        ({"uptime_s": 2.0, "health": 0}, "starting"),
+        ({"health": 0}, "inertial sensor missing"),
+    ],
+)
+def test_what_a_node_reports_becomes_a_reason(grown, words):
+    view = TeamMonitor()
+    for time_s, factor in ((1.0, 0.0), (2.0, 1.0)):
+        statuses = {"uptime_s": 1000.0} | {name: factor * value for name, value in grown.items()}
+        view.update_without_link(
+            time_s, [Status(time_s, 5, name, value) for name, value in statuses.items()]
+        )
+    assert view.rows(2.0)[0]["reasons"][0] == words

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from relpos.errors import DeviceError
+from relpos.measurements import Range
+from relpos.nodes import antenna
 from relpos.nodes.antenna import FAST_PERIOD_MS, ranging_fast, read_offsets_mm, store_offsets_mm
 from relpos.protocol.messages import CommandCode
 
@@ -64,3 +66,31 @@ def test_offsets_are_subtracted_from_the_next_range_on_once_they_are_read_or_sto
     assert told == {1: -0.02, 2: 0.03}
     with pytest.raises(DeviceError, match="node 2 has stored an offset of 1000 mm instead of 1500"):
         store_offsets_mm(nodes, (1, 2), (0, 1500))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("wanted", "come"), [(4, 4), (10, 6)])
+def test_ranges_are_collected_from_now_on_until_enough_or_none_comes(
+    monkeypatch: pytest.MonkeyPatch, wanted: int, come: int
+) -> None:
+    class Ranging:
+        """Two nodes that range in both directions for three seconds, beside a third."""
+
+        now_s = 0.0
+
+        def __init__(self) -> None:
+            self.observations: deque[Range] = deque()
+
+        def pause(self, _seconds: float) -> None:
+            self.observations.append(Range(0.0, 1, 2, 99.0))
+
+        def listen(self) -> None:
+            self.now_s += 1.0
+            if self.now_s <= 3.0:
+                pairs = ((1, 2), (2, 1), (1, 3))
+                self.observations += [Range(self.now_s, *pair, 5.0 * pair[1]) for pair in pairs]
+
+    ranging = Ranging()
+    monkeypatch.setattr(antenna, "time", SimpleNamespace(monotonic=lambda: ranging.now_s))
+    found = list(antenna.collect(ranging, (1, 2), wanted))  # type: ignore[arg-type]
+    assert found == [10.0, 5.0] * (come // 2)
+    assert ranging.now_s < 20.0

@@ -39,13 +39,6 @@ MAX_CHANGE = 1.6
 """People's gains differ by 10 %; a larger factor comes from another distance."""
 
 
-def leg_length_m(stature_m: float) -> float:
-    """Return the leg length for a stature; DataError where it is not an adult's."""
-    if not 1.0 <= stature_m <= 2.4:
-        raise DataError(f"a stature of {stature_m:g} m: give it in metres, for example 1.78")
-    return LEG_OF_STATURE * stature_m
-
-
 def scaled_gain_permille(gain_permille: int, step_scale: float) -> int:
     """Return the gain for steps ``step_scale`` times as long as the node reported.
 
@@ -93,11 +86,6 @@ class WalkFit:
     def scale(self) -> float:
         """True over reported length of the walk."""
         return self.true_m / self.measured_m
-
-    @property
-    def sigma(self) -> float:
-        """Relative standard deviation of the walk's scale about the wearer's."""
-        return math.hypot(WALK_SPREAD, STEP_SPREAD / math.sqrt(self.steps))
 
 
 def fit_walk(gain_permille: int, steps: int, measured_m: float, true_m: float) -> WalkFit:

@@ -297,7 +297,7 @@ def _walk(dialogue: NodeDialogue, distance_m: float, stature_m: float | None, ye
     from relpos.protocol import messages as wire
 
     if stature_m is not None:
-        leg_mm = round(1000.0 * steps.leg_length_m(stature_m))
+        leg_mm = round(1000.0 * (steps.LEG_OF_STATURE * stature_m))
         dialogue.demand(wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm)
         typer.echo(f"leg length: {leg_mm / 1000:.3f} m")
     gain = dialogue.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)

@@ -158,7 +158,6 @@ class ApiMode:
     def answers(self) -> bool:
         """Whether there is a module that speaks so; learns whether it escapes."""
         # Neither the question (as frame 1) nor the answer holds a byte that would be escaped.
-        self._frame_id = 0
         answer = self._ask_once("AP", b"")  # Once: most speeds have nobody.
         if answer is None or answer.status != 0:
             return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from relpos.calibration.steps import leg_length_m
+from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.protocol.messages import CommandCode
 
 
@@ -164,4 +164,4 @@ def _stature(text: str) -> Change:
         raise ValueError(f"stature '{text}': not a number") from None
     if not STATURE_M[0] <= stature_m <= STATURE_M[1]:
         raise ValueError(f"stature {text}: between {STATURE_M[0]:g} and {STATURE_M[1]:g} m")
-    return Change(BY_NAME["leg-length"], round(1000.0 * leg_length_m(stature_m)))
+    return Change(BY_NAME["leg-length"], round(1000.0 * (LEG_OF_STATURE * stature_m)))
