@@ -115,13 +115,14 @@ class Emulated:
     baud = 38400
 
     def __init__(self, address, escaped=True):
-        self.sent = b""
+        self.sent = self.heard = b""
         self.module = XbeeModule(address, 7, None, self._emit, escaped=escaped)
 
     def _emit(self, _time_us, data):
         self.sent += data
 
     def update_without_link(self, data):
+        self.heard += data
         self.module.from_serial(0, data)
         sent, self.sent = self.sent, b""
         return sent
@@ -161,6 +162,32 @@ def test_a_module_that_speaks_frames_is_set_by_frames(escaped):
     assert module.module.address == 4
     assert module.module._settings[b"AP"] == b"\2"
     assert module.module._settings[b"RN"] == b"\3"
+    assert b"WR" in module.heard
+
+
+class OfItsOwnSpeed(Emulated):
+    """A module that speaks API frames at 9600 baud until it is set to another speed."""
+
+    def __init__(self):
+        super().__init__(9)
+        self.baud = 9600
+        self.module._settings[b"BD"] = b"\3"
+
+    def update_without_link(self, data):
+        if b"BD\5" in data:  # which the emulator's refuses
+            self.baud = 38400
+            self.module._settings[b"BD"] = b"\5"
+        return super().update_without_link(data)
+
+
+def test_a_module_that_speaks_frames_at_another_speed_is_followed_to_the_teams(monkeypatch):
+    monkeypatch.setattr(radio, "GUARD_S", 0.1)
+    module = OfItsOwnSpeed()
+    with adapter(module) as path:
+        written = radio.configure(partial(open_port, path), radio.parameters(3))
+    assert module.baud == 38400
+    assert b"WR" in module.heard
+    assert {w.parameter.command: w.before for w in written}["BD"] == 3
 
 
 class Lossy:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -46,7 +47,7 @@ def doctor(
     findings = list(looked if json else _printed(looked))
     wrong = sum(finding.state is State.WRONG for finding in findings)
     if json:
-        document = {"well": not wrong, "findings": [f.to_json() for f in findings]}
+        document = {"well": not wrong, "findings": [asdict(f) for f in findings]}
         output.print_json(document)
     else:
         hints = sum(finding.state is State.HINT for finding in findings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -24,10 +24,6 @@ class Finding:
     state: State
     words: str
     remedy: str = ""
-
-    def to_json(self) -> dict[str, str]:
-        """Return the finding as `--json` prints it."""
-        return {**asdict(self), "state": str(self.state)}
 
 
 def well(name: str, words: str) -> Finding:
