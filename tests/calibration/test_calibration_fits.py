@@ -1,6 +1,7 @@
 """Calibration: ellipsoids, biases and gains that are known, found again or refused."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,7 @@ def test_a_few_readings_beside_steel_do_not_bend_the_ellipsoid():
         (lambda f, u: (f[f[:, 2] > f[:, 2].mean() + 15.0], None), "directions|uncertain|ellipsoid"),
         (lambda f, u: (f + np.linspace(0, 60, len(f))[:, None], u), "ellipsoid|uniform"),
         (lambda f, u: (4.0 * f, u), "Earth"),
+        (lambda f, u: turned(60, 0, noise_ut=1.5)[:2], "uncertain by 2.2 %"),
     ],
 )
 def test_readings_that_do_not_determine_it_are_refused_with_what_to_do(spoil, words):
@@ -114,6 +116,12 @@ def test_the_order_of_a_calibration_does_not_matter(order):
     result = guide.solve(samples)
     assert np.allclose(result.calibration.gyro_bias_rad_s, gyro, atol=np.radians(0.02))
     assert np.allclose(result.calibration.acceleration_bias_m_s2, bias, atol=0.02)
+    force = np.array([sample.acceleration_m_s2 for sample in samples])
+    corrected = np.linalg.norm(result.calibration.correct_acceleration(force), axis=1)
+    assert np.allclose(corrected, GRAVITY[2], atol=0.03)
+    fit = result.accelerometer
+    assert fit.residual_m_s2 < 0.005
+    assert 0.2 < fit.residual_before_m_s2 < 0.4
     assert np.allclose(result.calibration.field_offset_ut, (30.0, 5.0, -12.0), atol=0.5)
     assert 0.0 < np.degrees(result.calibration.gyro_bias_sigma_rad_s) < 0.2
 
@@ -129,7 +137,9 @@ def test_calibration_needs_rest_and_the_accelerometer_needs_sides():
 
 def test_what_was_not_measured_stays_as_it_was_calibrated():
     calibrated = guide.solve(samples_of(("still", "sides", "turn"))[0]).calibration
-    result = guide.solve(samples_of(("still",))[0], calibrated, with_magnetometer=False)
+    samples = [replace(s, magnetic_field_ut=None) for s in samples_of(("still",))[0]]
+    assert guide.progress(samples).readings == 0
+    result = guide.solve(samples, calibrated, with_magnetometer=False)
     assert result.accelerometer is None
     for name in ("acceleration_bias_m_s2", "acceleration_scale", "field_offset_ut", "field_matrix"):
         assert np.array_equal(getattr(result.calibration, name), getattr(calibrated, name))
@@ -209,6 +219,8 @@ def test_a_walk_that_does_not_match_the_stated_distance_is_refused():
         steps.fit_walk(2130, 40, 30.0, 60.0)
     with pytest.raises(DataError, match="steps"):
         steps.fit_walk(2130, 3, 2.0, 20.0)
+    with pytest.raises(DataError, match="a calibration walk of nan m"):
+        steps.fit_walk(2130, 40, 30.0, float("nan"))
 
 
 def test_an_accelerometer_that_is_stuck_at_zero_shows_no_attitude():
@@ -216,3 +228,20 @@ def test_an_accelerometer_that_is_stuck_at_zero_shows_no_attitude():
     rate[28:32, 0] = 2.0
     assert inertial.still_stretches(np.zeros((60, 3)), rate, np.full(60, 0.2))
     assert inertial.poses(np.zeros((60, 3)), rate, np.full(60, 0.2)) == []
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.05])
+def test_a_node_that_lay_on_its_corners_alone_has_no_scale(apart):
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    corners += apart * np.random.default_rng(0).standard_normal((8, 3))
+    forces = GRAVITY[2] * corners / np.linalg.norm(corners, axis=1)[:, None]
+    with pytest.raises(DataError, match="too similar"):
+        inertial.fit_accelerometer([inertial.Pose(force, 3.0) for force in forces])
+
+
+def test_a_steady_turn_is_no_attitude_at_rest():
+    turned = np.repeat(GRAVITY[2] * np.eye(3), 20, axis=0)
+    rate = np.zeros((60, 3))
+    rate[20:40, 1] = 0.5
+    shown = inertial.poses(turned, rate, np.full(60, 0.2))
+    assert [int(np.argmax(pose.force_m_s2)) for pose in shown] == [0, 2]
