@@ -61,6 +61,8 @@ def test_a_few_readings_beside_steel_do_not_bend_the_ellipsoid():
         (lambda f, u: (f[f[:, 2] > f[:, 2].mean() + 15.0], None), "directions|uncertain|ellipsoid"),
         (lambda f, u: (f + np.linspace(0, 60, len(f))[:, None], u), "ellipsoid|uniform"),
         (lambda f, u: (4.0 * f, u), "Earth"),
+        (lambda f, u: (f * [1.0, 1.0, 4.0], u), "times as long as wide"),
+        (lambda f, u: tuple(x[u[:, 2] > 2.0] for x in (f, u)), "% of the directions were"),
         (lambda f, u: turned(60, 0, noise_ut=1.5)[:2], "uncertain by 2.2 %"),
     ],
 )
@@ -127,8 +129,10 @@ def test_the_order_of_a_calibration_does_not_matter(order):
 
 
 def test_calibration_needs_rest_and_the_accelerometer_needs_sides():
+    turned = samples_of(("turn",))[0]
+    assert guide.progress(turned).attitudes == 0
     with pytest.raises(DataError, match="never lay still"):
-        guide.solve(samples_of(("turn",))[0])
+        guide.solve(turned)
     result = guide.solve(samples_of(("still", "turn"))[0])
     assert result.accelerometer is None
     assert "accelerometer" in result.remarks[0]
@@ -150,6 +154,18 @@ def test_a_node_that_is_held_is_not_lying_still():
     swaying = np.radians(2.0) * np.sin(time_s)[:, None] * np.ones(3)
     with pytest.raises(DataError, match="moved"):
         inertial.fit_gyro(swaying, np.full(50, 0.2))
+
+
+@pytest.mark.parametrize(("reports", "period_s"), [(14, 0.2), (4, 1.0)])
+def test_a_short_rest_gives_no_bias_of_the_gyroscope(reports, period_s):
+    with pytest.raises(DataError, match="at rest are too short for the gyroscope"):
+        inertial.fit_gyro(np.zeros((reports, 3)), np.full(reports, period_s))
+
+
+@pytest.mark.parametrize("scale", [float("nan"), float("inf"), 0.0, -1.0])
+def test_a_step_scale_that_is_no_positive_number_gives_no_gain(scale):
+    with pytest.raises(DataError, match="is not a positive number"):
+        steps.scaled_gain_permille(2140, scale)
 
 
 def test_the_picture_shows_before_and_after(tmp_path):
@@ -239,9 +255,9 @@ def test_a_node_that_lay_on_its_corners_alone_has_no_scale(apart):
         inertial.fit_accelerometer([inertial.Pose(force, 3.0) for force in forces])
 
 
-def test_a_steady_turn_is_no_attitude_at_rest():
-    turned = np.repeat(GRAVITY[2] * np.eye(3), 20, axis=0)
-    rate = np.zeros((60, 3))
+def test_a_steady_turn_and_a_short_stop_are_no_attitudes_at_rest():
+    turned = np.repeat(GRAVITY[2] * np.array([*np.eye(3), [0.0, 0.0, -1.0]]), 20, axis=0)[:66]
+    rate = np.zeros((66, 3))
     rate[20:40, 1] = 0.5
-    shown = inertial.poses(turned, rate, np.full(60, 0.2))
+    shown = inertial.poses(turned, rate, np.full(66, 0.2))  # the last for less than a second
     assert [int(np.argmax(pose.force_m_s2)) for pose in shown] == [0, 2]

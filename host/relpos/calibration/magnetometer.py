@@ -5,14 +5,11 @@ node (hard iron) moves its centre; soft iron and the sensor's own errors make it
 
     reading = offset + M^-1 R field,   |M (reading - offset)| = |field|
 
-1. The ellipsoid: algebraic least squares with the constraint 4 J - I^2 > 0, which only ellipsoids
-   (not too flat) fulfil: Q. Li and J. G. Griffiths, "Least squares ellipsoid specific fitting",
-   Geometric Modeling and Processing 2004. The algebraic distance overweights what lies far from the
-   centre, hence a second pass weighted by the inverse gradient (Taubin 1991; Sampson 1982).
-2. Least squares of the first-order geometric distance, (|M d| - r) / |grad|, over centre and
-   symmetric M: maximum likelihood where the sensor's noise is white and alike in all axes. The loss
-   is Huber's, against a few readings beside steel.
-3. The norm alone does not determine the rotation of M. Gravity does: the field's dip is the same
+1. The best sphere starts. Least squares of the first-order geometric distance, (|M d| - r) /
+   |grad|, over centre and symmetric M: maximum likelihood where the sensor's noise is white and
+   alike in all axes. The loss is Huber's, against a few readings beside steel: twice, because the
+   distances from a sphere do not show yet which readings these are.
+2. The norm alone does not determine the rotation of M. Gravity does: the field's dip is the same
    in every attitude, so up . (Q M d) must be one number for all readings, which gives the rotation
    Q. Without it the sphere would be round, but the *heading* wrong.
 
@@ -109,14 +106,12 @@ def coverage(vectors: FloatArray) -> float:
 
 
 def centre_guess(field_ut: FloatArray) -> FloatArray:
-    """Centre (3,) for a display while readings still come: of the best sphere, if it is one.
+    """Centre (3,) of the best sphere, if it is one.
 
     Least squares of |x|^2 = 2 c . x + const, held to the readings' own box where they are few.
     """
     low, high = field_ut.min(axis=0), field_ut.max(axis=0)
     middle = 0.5 * (low + high)
-    if len(field_ut) < 10:
-        return np.asarray(middle)
     shifted = field_ut - middle
     design = np.column_stack((2.0 * shifted, np.ones(len(shifted))))
     solution = np.linalg.lstsq(design, (shifted**2).sum(axis=1), rcond=1e-3)[0]
@@ -137,17 +132,9 @@ def fit(field_ut: FloatArray, up: FloatArray | None = None) -> MagnetometerFit:
             f"{len(readings)} magnetometer readings are too few, at least {MIN_READINGS} are "
             "needed: turn the node for a minute"
         )
-    scale = float(np.linalg.norm(readings - readings.mean(axis=0), axis=1).mean())
-    if scale < 1.0:
+    if float(np.linalg.norm(readings - readings.mean(axis=0), axis=1).mean()) < 1.0:
         raise DataError("the magnetometer readings do not change: turn the node in all directions")
-    shift = readings.mean(axis=0)
-    centre, shape = _algebraic((readings - shift) / scale)
-    for _ in range(2):
-        gradient = np.linalg.norm(((readings - shift) / scale - centre) @ shape, axis=1)
-        centre, shape = _algebraic((readings - shift) / scale, 1.0 / np.maximum(gradient, 1e-3))
-    offset, matrix, radius, uncertainty = _geometric(
-        readings, shift + scale * centre, shape / scale**2
-    )
+    offset, matrix, radius, uncertainty = _ellipsoid(readings)
     corrected = (readings - offset) @ matrix.T
     norms = np.linalg.norm(corrected, axis=1)
     raw = np.linalg.norm(readings, axis=1)
@@ -199,48 +186,6 @@ def _check(result: MagnetometerFit) -> None:
         )
 
 
-def _algebraic(
-    points: FloatArray, weights: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Centre (3,) and shape (3, 3) with (x - centre) shape (x - centre) = 1 for points (n, 3)."""
-    x, y, z = points.T
-    one = np.ones(len(points))
-    design = np.column_stack(
-        (x * x, y * y, z * z, 2 * y * z, 2 * x * z, 2 * x * y, 2 * x, 2 * y, 2 * z, one)
-    )
-    if weights is not None:
-        design = design * weights[:, None]
-    scatter = design.T @ design / len(points)
-    # k = 4: every ellipsoid whose short axis is at least half its long one is reached, and what is
-    # found is always an ellipsoid.
-    constraint = np.diag([-1.0, -1.0, -1.0, -4.0, -4.0, -4.0])
-    constraint[:3, :3] += np.ones((3, 3)) - np.eye(3)
-    a, b, d = scatter[:6, :6], scatter[:6, 6:], scatter[6:, 6:]
-    try:
-        lower = scipy.linalg.solve(d, b.T, assume_a="sym")
-        values, vectors = scipy.linalg.eig(scipy.linalg.solve(constraint, a - b @ lower))
-    except (scipy.linalg.LinAlgError, ValueError) as error:
-        raise _no_ellipsoid() from error
-    quadric = np.real(vectors[:, int(np.argmax(np.real(values)))])
-    rest = -lower @ quadric
-    form = np.array(
-        [
-            [quadric[0], quadric[5], quadric[4]],
-            [quadric[5], quadric[1], quadric[3]],
-            [quadric[4], quadric[3], quadric[2]],
-        ]
-    )
-    try:
-        centre = -np.linalg.solve(form, rest[:3])
-    except np.linalg.LinAlgError as error:
-        raise _no_ellipsoid() from error
-    level = float(centre @ form @ centre - rest[3])
-    shape = form / level if level != 0.0 else form
-    if not np.all(np.isfinite(shape)) or np.min(np.linalg.eigvalsh(shape)) <= 0.0:
-        raise _no_ellipsoid()
-    return centre, shape
-
-
 def _no_ellipsoid() -> DataError:
     return DataError(
         "the readings lie on no ellipsoid: turn the node in all directions, not about one axis"
@@ -256,13 +201,10 @@ def _symmetric(six: FloatArray) -> FloatArray:
     return matrix + np.triu(matrix, 1).T
 
 
-def _geometric(
-    readings: FloatArray, offset: FloatArray, shape: FloatArray
-) -> tuple[FloatArray, FloatArray, float, float]:
-    """Refine; returns offset, matrix of determinant 1, radius and the worst uncertainty."""
-    values, vectors = np.linalg.eigh(shape)
-    root = (vectors * np.sqrt(values)) @ vectors.T  # |root (x - offset)| = 1
-    radius = float(1.0 / np.linalg.det(root) ** (1.0 / 3.0))
+def _ellipsoid(readings: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+    """Return centre, matrix of determinant 1, radius and the worst uncertainty."""
+    centre = centre_guess(readings)
+    radius = float(np.linalg.norm(readings - centre, axis=1).mean())
 
     def distances(parameters: FloatArray) -> FloatArray:
         matrix = _symmetric(parameters[3:])
@@ -272,18 +214,19 @@ def _geometric(
         gradient = np.maximum(np.linalg.norm(u @ matrix, axis=1) / norm, 1e-9)
         return np.asarray((norm - 1.0) / gradient)
 
-    start = np.concatenate((offset / radius, (root * radius)[_SYMMETRIC]))
-    spread = float(np.median(np.abs(distances(start)))) * 1.4826
-    solution = scipy.optimize.least_squares(
-        distances, start, loss="huber", f_scale=max(2.0 * spread, 1e-4), x_scale="jac"
-    )
-    offset = solution.x[:3] * radius
-    matrix = _symmetric(solution.x[3:])
+    found = np.concatenate((centre / radius, np.eye(3)[_SYMMETRIC]))
+    for _ in range(2):
+        spread = float(np.median(np.abs(distances(found)))) * 1.4826
+        solution = scipy.optimize.least_squares(
+            distances, found, loss="huber", f_scale=max(2.0 * spread, 1e-4), x_scale="jac"
+        )
+        found = solution.x
+    offset, matrix = found[:3] * radius, _symmetric(found[3:])
     if np.min(np.linalg.eigvalsh(matrix)) <= 0.0:
         raise _no_ellipsoid()
     size = float(np.linalg.det(matrix) ** (1.0 / 3.0))
     # What the parameters' covariance does to a corrected reading, direction by direction.
-    noise = float(np.mean(distances(solution.x) ** 2)) * len(readings) / (len(readings) - 9)
+    noise = float(np.mean(distances(found) ** 2)) * len(readings) / (len(readings) - 9)
     info = solution.jac.T @ solution.jac
     try:
         covariance = noise * np.linalg.inv(info)
