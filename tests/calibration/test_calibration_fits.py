@@ -255,6 +255,15 @@ def test_a_node_that_lay_on_its_corners_alone_has_no_scale(apart):
         inertial.fit_accelerometer([inertial.Pose(force, 3.0) for force in forces])
 
 
+def test_a_side_that_is_laid_down_again_is_one_attitude_the_longer_time():
+    forces = GRAVITY[2] * np.eye(3)[[0, 1, 0, 1]]
+    forces[2:] += [0.0, 0.0, 0.5]  # three degrees beside
+    laid = np.repeat(forces, [20, 30, 30, 20], axis=0)
+    shown = inertial.poses(laid, np.zeros((100, 3)), np.full(100, 0.2))
+    assert [pose.duration_s for pose in shown] == pytest.approx([5.6, 5.6])
+    assert [pose.force_m_s2[2] for pose in shown] == pytest.approx([0.5, 0.0])
+
+
 def test_a_steady_turn_and_a_short_stop_are_no_attitudes_at_rest():
     turned = np.repeat(GRAVITY[2] * np.array([*np.eye(3), [0.0, 0.0, -1.0]]), 20, axis=0)[:66]
     rate = np.zeros((66, 3))

@@ -110,12 +110,6 @@ def still_stretches(
     """
     found: list[slice] = []
     begin = 0
-
-    def close(end: int) -> None:
-        inner = slice(begin + 1, end - 1)
-        if inner.stop > inner.start and float(duration_s[inner].sum()) >= MIN_POSE_S:
-            found.append(inner)
-
     for k in range(1, len(force_m_s2) + 1):
         if k < len(force_m_s2):
             force = force_m_s2[begin:k].mean(axis=0)
@@ -125,13 +119,15 @@ def still_stretches(
                 and float(np.max(np.abs(rate_rad_s[k] - rate))) <= 3.0 * STILL_RATE_RAD_S
             ):
                 continue
-        close(k)
+        inner = slice(begin + 1, k - 1)
+        if float(duration_s[inner].sum()) >= MIN_POSE_S:
+            found.append(inner)
         begin = k
     return found
 
 
 def poses(force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray) -> list[Pose]:
-    """Return the different attitudes at rest in order of time; repeated ones are merged.
+    """Return the different attitudes at rest in order of time, of a repeated one the longest.
 
     Arguments as of :func:`still_stretches`. Both force and rate must be free of motion: a steady
     turn shows a rate that no other stretch shows, and is dropped; so is a force unlike gravity.
@@ -151,14 +147,7 @@ def poses(force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray
             continue
         for k, other in enumerate(kept):
             if _angle_rad(pose.force_m_s2, other.force_m_s2) < POSE_APART_RAD:
-                total = pose.duration_s + other.duration_s
-                if _angle_rad(pose.force_m_s2, other.force_m_s2) < math.radians(2.0):
-                    mean = (
-                        pose.force_m_s2 * pose.duration_s + other.force_m_s2 * other.duration_s
-                    ) / total
-                    kept[k] = Pose(mean, total)
-                elif pose.duration_s > other.duration_s:
-                    kept[k] = pose
+                kept[k] = max(pose, other, key=lambda one: one.duration_s)
                 break
         else:
             kept.append(pose)
