@@ -130,13 +130,30 @@ def test_the_order_of_a_calibration_does_not_matter(order):
 
 def test_calibration_needs_rest_and_the_accelerometer_needs_sides():
     turned = samples_of(("turn",))[0]
-    assert guide.progress(turned).attitudes == 0
+    seen = guide.progress(turned)
+    assert (seen.attitudes, seen.still_s) == (0, 0.0)
     with pytest.raises(DataError, match="never lay still"):
         guide.solve(turned)
     result = guide.solve(samples_of(("still", "turn"))[0])
     assert result.accelerometer is None
-    assert "accelerometer" in result.remarks[0]
+    assert "1 attitudes at rest do not determine the accelerometer" in result.remarks[0]
     assert not guide.progress(samples_of(("still", "turn"))[0]).done(with_magnetometer=True)
+
+
+def test_four_sides_give_the_bias_of_the_accelerometer_alone():
+    samples, bias, _ = samples_of(("still", "sides"))
+    assert guide.progress(samples).done(with_magnetometer=False)
+    assert not guide.progress(samples).done(with_magnetometer=True)
+    force, rate = (
+        np.array([getattr(s, name) for s in samples])
+        for name in ("acceleration_m_s2", "angular_rate_rad_s")
+    )
+    sides = inertial.poses(force, rate, np.full(len(samples), 0.2))
+    fit = inertial.fit_accelerometer([sides[k] for k in (0, 1, 2, 4)])
+    assert fit.partial
+    assert np.array_equal(fit.scale, np.zeros(3))
+    assert np.allclose(fit.bias_m_s2, bias, atol=0.15)  # with 1 % of scale in it
+    assert not inertial.fit_accelerometer(sides).partial
 
 
 def test_what_was_not_measured_stays_as_it_was_calibrated():

@@ -42,7 +42,7 @@ class Samples:
 def gather(samples: Sequence[RawSample]) -> Samples:
     """Return the samples with inertial data as arrays."""
     missing = (np.nan, np.nan, np.nan)
-    kept = [s for s in samples if s.acceleration_m_s2 and s.angular_rate_rad_s]
+    kept = [s for s in samples if s.acceleration_m_s2]
     return Samples(
         np.array([s.acceleration_m_s2 for s in kept]).reshape(-1, 3),
         np.array([s.angular_rate_rad_s for s in kept]).reshape(-1, 3),
