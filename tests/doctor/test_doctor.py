@@ -199,6 +199,24 @@ def test_processes_whose_names_are_cut_amid_a_letter_are_listed(tmp_path):
             process.kill()
 
 
+def test_the_program_that_has_a_file_open_is_found_among_all(tmp_path):
+    with (tmp_path / "port").open("w"):
+        (holder,) = Computer().holders(str(tmp_path / "port"))
+    assert holder.endswith(f" ({os.getpid()})")
+    assert Computer().holders(str(tmp_path / "port")) == []
+
+
+def test_a_command_that_fails_has_said_nothing():
+    assert Computer().output_of("sh", "-c", "echo heard") == "heard\n"
+    assert Computer().output_of("sh", "-c", "echo heard; exit 1") == ""
+    assert Computer().output_of("/no/such/command") == ""
+
+
+def test_a_compiler_of_ones_own_is_looked_for(tmp_path):
+    _, words, _ = finding(installed(tmp_path, variables={"CXX": "clang++"}), "g++")
+    assert "clang++ is missing" in words
+
+
 def test_the_key_has_to_be_one_and_to_be_the_owners_alone(tmp_path):
     assert finding(installed(tmp_path), "team's key")[0] == "hint"
     key = tmp_path / "team.key"
@@ -231,6 +249,11 @@ def test_a_missing_browser_or_screen_is_a_hint_that_names_alternatives(tmp_path)
         assert state == "hint"
         assert "--view-listen" in words
         assert "--terminal" in words
+    for differences in (
+        {"variables": {"WAYLAND_DISPLAY": "w"}},
+        {"platform": "darwin", "commands": ()},
+    ):
+        assert finding(installed(tmp_path, **differences), "browser")[0] == "well"
 
 
 def test_a_clock_before_the_counters_is_wrong_and_an_unsynchronised_one_is_a_hint(tmp_path):
@@ -280,8 +303,10 @@ def test_services_that_take_new_ports_are_named():
     found = ports(running=("ModemManager", "brltty"))
     assert finding(found, "ModemManager")[0] == "hint"
     assert finding(found, "brltty")[0] == "wrong"
-    ignored = ports(running=("ModemManager",), answers={"udevadm": "ID_MM_DEVICE_IGNORE=1\n"})
-    assert [f.name for f in ignored] == [f"port {PORT}"]
+    for what in ("DEVICE", "PORT"):
+        answers = {"udevadm": f"ID_MM_{what}_IGNORE=1\n"}
+        ignored = ports(running=("ModemManager",), answers=answers)
+        assert [f.name for f in ignored] == [f"port {PORT}"]
 
 
 # -- the module ------------------------------------------------------------------------------------
@@ -355,6 +380,22 @@ def test_another_network_is_a_hint(monkeypatch):
     state, words, _ = coordinator_finding({b"ID": b"\x12\x34"}, monkeypatch)
     assert state == "hint"
     assert "ID=1234 instead of 3332" in words
+
+
+def test_a_module_from_the_shelf_is_wrong(monkeypatch):
+    class Shelf:
+        def from_serial(self, _, data):
+            if data == b"+++":
+                self.on_serial(0, b"OK\r")
+
+    monkeypatch.setattr(radio, "GUARD_S", 0.001)
+    monkeypatch.setattr(radio, "ANSWER_S", 0.01)
+    state, words, remedy = finding(
+        devices.look(Pretended(), PORT, partial(Wire, Shelf())), "coordinator"
+    )
+    assert state == "wrong"
+    assert "without API frames: factory settings" in words
+    assert remedy == f"relpos node radio {PORT} --coordinator"
 
 
 def test_a_port_with_no_module_is_wrong(monkeypatch):

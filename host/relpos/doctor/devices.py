@@ -89,7 +89,7 @@ def _no_permission(computer: Computer, port: str, name: str) -> Finding:
 def _programs_that_grab(computer: Computer, ports: list[SerialPort]) -> Iterator[Finding]:
     """Report services that open new ports for a modem or a Braille display."""
     usb = [p for p in ports if p.vid is not None]
-    running = set(computer.processes().values()) if usb else set()
+    running = set(computer.processes().values())
     if "ModemManager" in running:
         free = [p.device for p in usb if not _ignored_by_modem_manager(computer, p.device)]
         if free:
