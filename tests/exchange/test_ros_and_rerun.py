@@ -16,8 +16,8 @@ from relpos.exchange.content import Content
 from relpos.exchange.rrd import write_rrd
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Range
-from relpos.runs import Run, load_run, read_estimates, save_run
-from support.small_team import convert, refused, run, written
+from relpos.runs import Run, load_run, read_estimates, save_run, write_estimates
+from support.small_team import convert, estimates, refused, run, written
 
 START = "2026-05-04T09:30:00Z"
 START_UNIX_S = 1777887000.0
@@ -25,7 +25,10 @@ START_UNIX_S = 1777887000.0
 
 @pytest.fixture(scope="module")
 def team(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return written(tmp_path_factory.mktemp("team"))
+    run, estimate = written(tmp_path_factory.mktemp("team"))
+    lost = {(3, second): NodeStatus.AMBIGUOUS for second in range(1, 6)}
+    write_estimates(estimate, estimates(statuses=lost))
+    return run, estimate
 
 
 @pytest.fixture(scope="module")
