@@ -439,7 +439,7 @@ def test_a_map_comes_back_to_the_millimetre(tmp_path: Path, form: str) -> None:
     save_run(replace(run(), landmarks=LANDMARKS[1:]), yard)
     path = tmp_path / f"map.{form}"
     words = ("--pin", PIN, "--start", START)
-    convert(fused, "--run", yard, *words, "--to", form, "--out", path)
+    assert not convert(fused, "--run", yard, *words, "--to", form, "--out", path).remarks
     convert(path, *words, "--to", "run", "--out", tmp_path / "back")
     for sent, back in zip(estimates(), read_estimates(tmp_path / "back"), strict=True):
         assert sent.time_s == pytest.approx(back.time_s, abs=1e-3)
@@ -639,7 +639,7 @@ def test_a_track_of_gnss_becomes_truth(tmp_path: Path) -> None:
         there = on_map(x_m, y_m)
         points.append(
             f'<trkpt lat="{there["lat2"]:.9f}" lon="{there["lon2"]:.9f}">'
-            f"<time>2026-05-04T09:30:{second:02d}Z</time></trkpt>"
+            f"<ele>520</ele><time>2026-05-04T09:30:{second:02d}Z</time></trkpt>"
         )
     (tmp_path / "watch.gpx").write_text(
         '<?xml version="1.0"?><gpx version="1.1" creator="watch" '
@@ -648,7 +648,7 @@ def test_a_track_of_gnss_becomes_truth(tmp_path: Path) -> None:
         + "</trkseg></trk></gpx>"
     )
     convert(yard, "--to", "mcap", "--out", tmp_path / "yard.mcap")
-    words = ("--as", "truth", "--node", 2, "--pin", PIN, "--to", "run")
+    words = ("--as", "truth", "--node", 2, "--pin", "48.137,11.575,60", "--to", "run")
     words += ("--run", tmp_path / "yard.mcap")
     result = convert(tmp_path / "watch.gpx", *words, "--out", tmp_path / "with-truth")
     assert any("second 0 is 2026-05-04T09:30:00" in line for line in result.remarks)
@@ -810,6 +810,12 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
             "[[48.1,11.5],[48.1,11.5]]",
             '{"node":1,"of":"truth","time_s":[1,2]}',
             "are latitude and longitude swapped",
+        ),
+        (
+            "LineString",
+            "[[11.5,91],[11.5,91]]",
+            '{"node":1,"of":"truth","time_s":[1,2]}',
+            "[11.5, 91] is no longitude and latitude",
         ),
         (
             "LineString",

@@ -15,7 +15,7 @@ import pytest
 from relpos.exchange.content import Content
 from relpos.exchange.rrd import write_rrd
 from relpos.fusion.estimator import NodeStatus
-from relpos.measurements import Range
+from relpos.measurements import Range, Truth
 from relpos.runs import Run, load_run, read_estimates, save_run, write_estimates
 from support.small_team import convert, estimates, refused, run, written
 
@@ -134,7 +134,9 @@ def test_a_failed_range_is_infinite_in_a_bag_as_rep_117_has_it(tmp_path: Path) -
 
     failed = Range(2.5, 2, 3, 0.0)
     yard = run()
-    save_run(replace(yard, measurements=(*yard.measurements, failed)), tmp_path / "yard")
+    flat = (Truth(0.0, 1, 1.0, 2.0),)
+    yard = replace(yard, measurements=(*yard.measurements, failed), truth=flat)
+    save_run(yard, tmp_path / "yard")
     convert(tmp_path / "yard", "--to", "rosbag2", "--out", tmp_path / "bag")
     with AnyReader(
         [tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
