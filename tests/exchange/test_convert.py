@@ -295,6 +295,8 @@ def test_the_files_of_a_live_session_are_converted_with_its_recording(tmp_path: 
     convert(tmp_path / "live", "--to", "csv", "--out", tmp_path / "tables")
     assert "Kim" in (tmp_path / "tables" / "estimate.csv").read_text("utf-8")
     assert "true_distance_m" not in (tmp_path / "tables" / "pairs.csv").read_text("utf-8")
+    convert(tmp_path / "live", "--pin", PIN, "--to", "gpx", "--out", tmp_path / "walk.gpx")
+    assert "<name>live</name>" in (tmp_path / "walk.gpx").read_text("utf-8")
     assert load_run(tmp_path / "tables").motions == run().motions
 
 
