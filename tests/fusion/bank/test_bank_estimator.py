@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import relpos
 from relpos import fusion, settings
 from relpos.errors import RelposError
 from relpos.evaluation import metrics
@@ -116,3 +117,13 @@ def test_ranges_of_nodes_that_are_sought_do_not_end_rounds_of_those_that_are_loc
     core = estimator.estimator.core
     assert isinstance(core, Bank)
     assert core.detection.rounds._turns == 1.0
+
+
+def test_two_people_who_range_often_are_not_drawn_together() -> None:
+    """Between two a missed attempt is never seen: that one succeeded says nothing of nearness."""
+    often = {"nodes": 2, "seconds": 60, "range_rate_hz": 20, "sigma_range_m": 0.3}
+    for seed in (2, 5):
+        run = relpos.simulate("mission-base", seed, **often)
+        found = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
+        assert found.relative_distance_rmse_m < 0.3
+        assert found.nees_distance < 1.4

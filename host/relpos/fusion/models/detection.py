@@ -19,6 +19,8 @@ A missed attempt has other causes than distance, so it counts with care:
   received at all: pairs that never range each other tell nothing;
 * the UWB of a node that nobody receives may have failed: a two-state hidden Markov chain carries
   each node's probability of that, and its missed attempts count by so much less;
+* of two who range nobody else no miss is ever seen, and no curve learned: their ranges, however
+  many, say nothing of how near they are;
 * what blocks a pair now blocks it a second later: the correlation rho of consecutive surprises is
   measured, and each attempt counts (1 - rho) / (1 + rho) independent ones, the effective sample
   count of a first-order autoregressive sequence.
@@ -138,7 +140,8 @@ class Rounds:
                 missed.append(pair)
         missed.sort()
         self._open, self._directed = set(), set()
-        ordered = sorted(received)
+        ends = Counter(chain.from_iterable(self.ever_received))
+        ordered = sorted(pair for pair in received if ends[pair[0]] + ends[pair[1]] > 2)
         if level is not None:
             ordered = list(compress(ordered, level(ordered)))
             missed = list(compress(missed, level(missed)))
