@@ -34,8 +34,8 @@ SLOW_M = 0.005
 """Slow bias, m/sqrt(s)."""
 LEVEL_M = 0.003
 """What a wearer's height changes without stairs, m/sqrt(s): ramps, half a step."""
-UNSEEN_M = 0.2
-"""What it may change without a reported height, m/sqrt(s): a floor in five minutes."""
+UNSEEN_M = 0.25
+"""What it may change without a reported height, m/sqrt(s): a floor in three minutes."""
 UNSEEN_SLOW_M = 0.05
 """A node that was silent may have restarted, and begins at another pressure; m/sqrt(s)."""
 UNSEEN_S = 3.0
