@@ -356,14 +356,20 @@ bool in_force(Team& team, Node& node, const Words& words) {
   return true;
 }
 
+wire::Beacon beacon_of(uint8_t count, uint8_t first_id = 1) {
+  wire::Beacon beacon = {};
+  beacon.period_ms = 2000;
+  beacon.count = count;
+  for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(first_id + i);
+  return beacon;
+}
+
 void send_beacon(Team& team, uint8_t count, uint8_t first_id = kId, uint16_t phase_ms = 0,
                  uint8_t round = 0, uint16_t period_ms = 2000) {
-  wire::Beacon beacon = {};
+  wire::Beacon beacon = beacon_of(count, first_id);
   beacon.phase_ms = phase_ms;
   beacon.period_ms = period_ms;
   beacon.round = round;
-  beacon.count = count;
-  for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(first_id + i);
   uint8_t body[wire::kBeaconBytes];
   const uint8_t length = wire::encode(beacon, body);
   team.world.down(wire::MessageType::kBeacon, body, length, wire::kBroadcast,
@@ -479,12 +485,9 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
     uint32_t busy_until_ms = 0;
     for (uint32_t now_ms = 0; now_ms < 60000; ++now_ms) {
       if (now_ms % 1000 == 0) {
-        wire::Beacon beacon;
+        wire::Beacon beacon = beacon_of(20);
         beacon.phase_ms = static_cast<uint16_t>(now_ms % 2000);
-        beacon.period_ms = 2000;
         beacon.round = static_cast<uint8_t>(now_ms / 2000);
-        beacon.count = 20;
-        for (uint8_t i = 0; i < 20; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
         plan.beacon(static_cast<uint16_t>(now_ms), beacon, id);
       }
       if (now_ms < busy_until_ms) continue;
@@ -509,10 +512,7 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
 }
 
 TEST(a_node_retries_only_peers_it_ranged_recently_in_its_window) {
-  wire::Beacon beacon;
-  beacon.period_ms = 2000;
-  beacon.count = 6;
-  for (uint8_t i = 0; i < 6; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  wire::Beacon beacon = beacon_of(6);
   relpos::RangingPlan plan = relpos::RangingPlan();
   plan.begin(0, 1);
   uint16_t others = 0, in_a_row = 0, most_in_a_row = 0, most_later = 0, retried = 0;
@@ -570,10 +570,7 @@ TEST(without_a_beacon_nobody_is_asked_twice_in_a_row_and_no_seed_makes_rounds_al
 }
 
 TEST(an_exchange_that_fails_after_the_next_beacon_costs_no_round) {
-  wire::Beacon beacon;
-  beacon.period_ms = 2000;
-  beacon.count = 20;
-  for (uint8_t i = 0; i < beacon.count; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  wire::Beacon beacon = beacon_of(20);
   relpos::RangingPlan plan = relpos::RangingPlan();
   plan.begin(0, 1);
   uint8_t exchanges[12] = {};
@@ -707,10 +704,7 @@ TEST(a_node_whose_number_is_beyond_the_team_ranges_all_of_it) {
 }
 
 TEST(a_beacon_within_a_window_begins_no_second_round) {
-  wire::Beacon beacon;
-  beacon.period_ms = 2000;
-  beacon.count = 4;
-  for (uint8_t i = 0; i < 4; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  wire::Beacon beacon = beacon_of(4);
   relpos::RangingPlan plan = relpos::RangingPlan();
   plan.begin(0, 1);
   uint16_t exchanges = 0;
