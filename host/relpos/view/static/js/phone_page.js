@@ -586,6 +586,7 @@ function resumeMayday() {
 /** Called until the session has it: whoever calls may have no hand for a second time. */
 async function callMayday(call) {
   clearTimeout(maydayTimer);
+  if (store.getItem(MAYDAY) === null) return; // The board has it.
   if (byId("mayday-words").textContent === "") setText(byId("mayday-words"), t("mayday.sending"));
   try {
     await postJson("/api/mayday", { ...call, on: true });
@@ -601,7 +602,7 @@ async function callMayday(call) {
     if (store.getItem(MAYDAY) === null) return; // The board had it first.
     setText(byId("mayday-words"), t("mayday.failed", { error: error.message }));
     if (!error.again) store.removeItem(MAYDAY);
-    else maydayTimer = setTimeout(() => store.getItem(MAYDAY) !== null && callMayday(call), MAYDAY_AGAIN_MS);
+    else maydayTimer = setTimeout(() => callMayday(call), MAYDAY_AGAIN_MS);
   }
 }
 byId("marker-place").addEventListener("click", async () => {
