@@ -148,7 +148,7 @@ class Board:
 
     people: dict[int, Place] = field(default_factory=dict)
     mayday: dict[int, dict[str, Any]] = field(default_factory=dict)
-    calls: set[str] = field(default_factory=set)
+    mayday_ids: set[str] = field(default_factory=set)
     """The ids of the MAYDAYs that were called: a phone repeats its call until it has an answer."""
     roll_call: RollCall | None = None
     evacuation: Evacuation | None = None
@@ -160,7 +160,7 @@ class Board:
     def to_message(self) -> dict[str, Any]:
         """Return the message ``board`` of the page's protocol."""
         message = {"type": "board", **asdict(self)}
-        del message["calls"]
+        del message["mayday_ids"]
         return message
 
     @property
@@ -321,9 +321,9 @@ class Board:
         if event.get("on"):
             if "id" in event:
                 call = _id(event["id"])
-                if call in self.calls:
+                if call in self.mayday_ids:
                     return None  # On its way for long: it may have been ended meanwhile.
-                self.calls.add(call)
+                self.mayday_ids.add(call)
             self.mayday[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
             return Said("mayday-of", "{whom}MAYDAY", whom="")
         if self.mayday.pop(event["node"], None) is None:
